@@ -1,4 +1,4 @@
-# make run and make test do all their own set-up: they need only Python 3.11, git and make.
+# make run and make test set everything up themselves; they need only Python 3.11, git and make.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -13,11 +13,11 @@ PYTEST := $(BIN)/python -m pytest -n auto --dist loadgroup
 run: $(INSTALLED)
 	$(BIN)/python -m armscan.run $(ARGS)
 
-# Six to twelve minutes on two cores: without servers, clusters, browsers and runs in processes of their own.
+# Six to twelve minutes on two cores: no servers, clusters, browsers, or runs in separate processes.
 test: $(INSTALLED)
 	$(PYTEST) -m "not full and not slow" $(ARGS)
 
-# What `make test` leaves out of `make test-full`.
+# The tests of `make test-full` that `make test` leaves out.
 test-rest: $(INSTALLED)
 	$(PYTEST) -m "full and not slow" $(ARGS)
 

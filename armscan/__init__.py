@@ -1,4 +1,4 @@
-"""Armscan: agents that find the carpal tunnel's plane in labelmaps of the arm, and sweeps over how they learn it.
+"""armscan: agents that find the carpal tunnel's plane in labelmaps of the arm, and hyperparameter sweeps over them.
 
 Importing the package registers the environment `armscan/Armscan-v0` with Gymnasium and loads nothing else.
 """

@@ -1,4 +1,4 @@
-"""`python -m armscan` is the program `armscan`."""
+"""Run the command `armscan` as `python -m armscan`."""
 
 import sys
 

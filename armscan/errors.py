@@ -11,7 +11,7 @@ import sys
 import textwrap
 from collections.abc import Iterable
 
-# What steers a terminal, turns the direction of a text, or is only half a character.
+# Control characters, line separators, bidirectional formatting characters and lone surrogates.
 CONTROLS = re.compile("[\x00-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
@@ -24,7 +24,7 @@ class ArmscanError(Exception):
 
 
 def print_error(message: str) -> None:
-    """Print a mistake as an error; its lines break between words on a terminal, and nowhere in a file or pipe."""
+    """Print an error message, wrapped between words on a terminal, and on one line in a file or pipe."""
     line = f"error: {message}"
     if sys.stderr.isatty():
         width = shutil.get_terminal_size().columns
@@ -45,7 +45,7 @@ class ManifestError(ArmscanError, ValueError):
 
 
 class MarkupError(ArmscanError, ValueError):
-    """A markups file of 3D Slicer is damaged, or its plane is none that an agent can move to."""
+    """A markups file of 3D Slicer cannot be read or written, or no agent can move to its plane."""
 
 
 class OptimalPlaneError(ArmscanError, ValueError):
@@ -57,11 +57,11 @@ class ResetNeededError(ArmscanError, RuntimeError):
 
 
 class ExportError(ArmscanError, RuntimeError):
-    """A policy cannot be exported as a model, or the model does not act as the agent does."""
+    """A policy cannot be exported as a model, or the model acts differently from the agent."""
 
 
 class DivergedError(ArmscanError, ArithmeticError):
-    """Learning has led to weights that are not finite."""
+    """Training has diverged: some weights are not finite."""
 
 
 class CheckpointError(ArmscanError, ValueError):
@@ -73,7 +73,7 @@ class ChangedVolumesError(ArmscanError, ValueError):
 
 
 class FolderInUseError(ArmscanError, RuntimeError):
-    """Another process is at work in a run's folder."""
+    """Another process is using a run's folder."""
 
 
 class FolderTakenError(ArmscanError, ValueError):
@@ -85,15 +85,15 @@ class ResumeError(ArmscanError, RuntimeError):
 
 
 class UntrustedError(ArmscanError, RuntimeError):
-    """A stored value, which a stranger may have written, would be executed."""
+    """Acting on a stored value, which a stranger may have written, is unsafe."""
 
 
 class DisplayError(ArmscanError, RuntimeError):
-    """There is no screen, notebook or library that could show a window."""
+    """No screen, notebook or library is available to show a window."""
 
 
 class ServiceUnavailableError(ArmscanError, RuntimeError):
-    """A service cannot be reached, and is not waited for any longer."""
+    """A service is unavailable, and is not retried any further."""
 
 
 class TrackingError(ArmscanError, RuntimeError):
@@ -101,7 +101,7 @@ class TrackingError(ArmscanError, RuntimeError):
 
 
 class TrackingUnavailableError(TrackingError, ServiceUnavailableError):
-    """The tracking store cannot be reached, and is not waited for any longer."""
+    """The tracking store is unavailable, and is not retried any further."""
 
 
 class StudyError(ArmscanError, RuntimeError):
@@ -109,11 +109,11 @@ class StudyError(ArmscanError, RuntimeError):
 
 
 class StorageUnavailableError(StudyError, ServiceUnavailableError):
-    """The storage of a study cannot be reached, and is not waited for any longer."""
+    """The storage of a study is unavailable, and is not retried any further."""
 
 
 def is_interruption(error: BaseException | None) -> bool:
-    """Return whether an error is an interrupt or follows from one: compiled code can turn it into any other error."""
+    """Return whether an error is or follows from a `KeyboardInterrupt`, which compiled code can turn into any error."""
     while error is not None:
         if isinstance(error, KeyboardInterrupt):
             return True
@@ -122,7 +122,7 @@ def is_interruption(error: BaseException | None) -> bool:
 
 
 def listed(allowed: Iterable[object]) -> str:
-    """Return the allowed values as they are written in a message: 'a, b or c'."""
+    """Return the allowed values, joined for a message: 'a, b or c'."""
     names = [str(value) for value in allowed]
     return names[0] if len(names) == 1 else ", ".join(names[:-1]) + f" or {names[-1]}"
 
@@ -134,5 +134,5 @@ def few(names: Iterable[object], most: int = 4) -> str:
 
 
 def printable(text: str) -> str:
-    """Return a string that is safe to show in a terminal: control characters are spelled out."""
+    """Return a string that is safe to show in a terminal: control characters are escaped."""
     return CONTROLS.sub(lambda found: found[0].encode("unicode_escape").decode(), text)

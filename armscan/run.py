@@ -8,8 +8,8 @@ from armscan.utils.processes import collect_garbage_rarely, limit_threads, no_ga
 
 limit_threads()
 collect_garbage_rarely()
-# Ray reads it when it is imported, which other libraries do where it is installed: it would abort a study that is told
-# to end with a trace.
+# Ray reads this when it is imported, and other libraries import Ray if it is installed. Without it, Ray aborts a study
+# that is asked to end, and prints a stack trace.
 os.environ.setdefault("RAY_DISABLE_FAILURE_SIGNAL_HANDLER", "1")
 
 import signal
@@ -53,7 +53,7 @@ def run(config: DictConfig) -> None:
     made = "" if invocation.choices["data"] == "nifti" else " (phantoms are made when first asked for, four a second)"
     print(f"preparing data={invocation.choices['data']}, agent={invocation.choices['agent']}{made}", flush=True)
     try:
-        # Deferred: a mistake on the command line should be answered before torch and the like are loaded.
+        # Deferred: a mistake on the command line should be reported before torch is loaded.
         with no_garbage_collection():
             from armscan.experiment.runner import run_experiment
 
@@ -61,7 +61,7 @@ def run(config: DictConfig) -> None:
     except KeyboardInterrupt as error:
         remove_if_untracked(invocation.folder, error)
         raise
-    # Answered here: on its way out, Hydra would print lines of its own.
+    # Reported here: if it reached Hydra, Hydra would print messages of its own.
     except Exception as error:
         remove_if_untracked(invocation.folder, error)
         if is_interruption(error):
@@ -70,20 +70,20 @@ def run(config: DictConfig) -> None:
 
 
 def raise_or_exit(error: BaseException) -> NoReturn:
-    """Answer a user's mistake in one line and leave; raise any other error, or all where tracebacks are wanted."""
+    """Report a user's mistake in one line and exit; raise any other error, or every error if tracebacks are wanted."""
     if not print_mistake(error):
         raise error
     raise SystemExit(2)
 
 
 def launch(words: Sequence[str]) -> None:
-    """Run the command with Hydra, as if these words had been typed."""
+    """Run the command through Hydra, with these words as its arguments."""
     sys.argv[1:] = words
     application(run)()
 
 
 def repeat_grid(words: Sequence[str]) -> None:
-    """Run those jobs of a grid that have not finished."""
+    """Run the jobs of a grid that have not finished."""
     Multirun.is_repeated = True
     launch([MULTIRUN[0], *words])
 
@@ -92,19 +92,19 @@ def main() -> int:
     """Run the command line; return the exit code."""
     if os.environ.get("HYDRA_FULL_ERROR") == "1":
         os.environ[TRACEBACKS] = "1"
-    # Hydra raises, so that its errors are answered here and not by Hydra.
+    # Makes Hydra raise its errors, so that they are reported here.
     os.environ["HYDRA_FULL_ERROR"] = "1"
-    # A run that is ended by Ctrl-C or kill is closed as killed in the tracking store.
+    # Treat SIGTERM like Ctrl-C: the run is closed as KILLED in the tracking store.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     silence_libraries()
-    # Hydra reads its options only before the first override, and people write them anywhere.
+    # Hydra reads its options only before the first override, but users type them anywhere.
     sys.argv[1:] = sorted(sys.argv[1:], key=lambda word: word not in MULTIRUN)
     try:
         check_words(sys.argv[1:])
         if any(word.startswith(f"{SWEEP}=") for word in sys.argv[1:]):
             if PLAN not in sys.argv[1:]:
                 print("preparing a study: its space is checked first", flush=True)
-            # Deferred, after the first line: wrong words are answered before Optuna is loaded.
+            # Deferred until after the first line; invalid overrides are reported before Optuna is loaded.
             from armscan.sweeps.study.arguments import check_training_overrides
 
             check_training_overrides(sys.argv[1:])
@@ -115,7 +115,7 @@ def main() -> int:
             print_grid_plan(sys.argv[1:])
             return 0
         if any(word.startswith(f"{RESUME}=") for word in sys.argv[1:]):
-            # Before Hydra composes a configuration, and makes a folder: a run that goes on has both.
+            # Before Hydra composes a configuration and creates a folder: a resumed run has both.
             from armscan.experiment.resume import resume
 
             resume(sys.argv[1:], repeat_grid)
@@ -128,7 +128,7 @@ def main() -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except (KeyboardInterrupt, Exception) as error:
-        # Raised inside compiled code, an interrupt can come out as any other error.
+        # An interrupt inside compiled code can surface as any other error.
         if is_interruption(error):
             end_multirun(is_interrupted=True)
             print(INTERRUPTED, file=sys.stderr)
@@ -139,7 +139,7 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    # The module under its own name: jobs in other processes find their function there.
+    # Imported under its own name, where jobs in other processes look up their function.
     from armscan.run import main as run_main
 
     sys.exit(run_main())

@@ -1,7 +1,7 @@
 """Optuna's dashboard of the studies in ARMSCAN_STORAGE: `dashboard.py ADDRESS:PORT`.
 
-It answers browsers that ask for a host in DASHBOARD_HOSTS. Optuna's own program answers any, and refuses a database
-without tables, as it is before the first worker has come.
+It serves only requests for a host in DASHBOARD_HOSTS. Optuna's own program serves any host, and refuses a database
+without tables, as it is before the first worker starts.
 """
 
 from __future__ import annotations

@@ -1,2 +1,2 @@
--- Beside that of the studies, which PostgreSQL's image makes by itself: the database of MLflow's server.
+-- The database of MLflow's server; PostgreSQL's image itself creates the one of the studies.
 CREATE DATABASE mlflow;

@@ -1,6 +1,6 @@
 #!/bin/sh
-# Becomes the command that it is given, which then has the password of the database where every client looks for it: from
-# the file of a secret, or from the environment. So it stands in no address and in no command line.
+# Execute a command with the database password in PGPASSWORD, where every client looks for it. The password comes from a
+# secret's file or from the environment, so no address and no command line contains it.
 set -eu
 if [ -n "${ARMSCAN_STORAGE_PASSWORD_FILE:-}" ]; then
     PGPASSWORD="$(cat "$ARMSCAN_STORAGE_PASSWORD_FILE")"

@@ -1,4 +1,4 @@
-"""Health check of a worker: exit with 0 if one is at work in this container."""
+"""Health check of a worker: exit with 0 if one is running in this container."""
 
 from __future__ import annotations
 

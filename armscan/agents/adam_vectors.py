@@ -1,4 +1,4 @@
-"""The weights of a network and Adam's state as vectors, which compiled code changes in place."""
+"""A network's weights and Adam's state as vectors, which compiled code updates in place."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from armscan.agents.mlp_kernels import Adam, Floats, Weights
 class AdamVectors:
     """Weights and optimiser state as flat vectors; torch's tensors are views of them.
 
-    Network, optimiser and compiled code share this memory: each sees the changes of the others, and torch and compiled
-    code may take gradient steps in turn.
+    Network, optimiser and compiled code share this memory: each sees the others' changes, and torch and compiled code
+    may take gradient steps in turn.
 
     Args:
         optimiser: Adam, with one group of parameters.
@@ -31,7 +31,7 @@ class AdamVectors:
         steps = np.zeros(len(self._parameters), np.float32)
         self.weights = Weights(values, gradient, exp_avg, exp_avg_sq, steps)
         self._take_over_state(optimiser)
-        # Loading puts other tensors in the place of the views.
+        # Loading a state replaces the views by other tensors.
         optimiser.register_load_state_dict_post_hook(self._take_over_state)
 
     def settings(self) -> Adam:
@@ -67,7 +67,7 @@ def flattened(parameters: list[nn.Parameter]) -> Floats:
 
 
 def _views(vector: Floats, parameters: list[nn.Parameter], *, is_scalar: bool = False) -> list[torch.Tensor]:
-    """Return the part of a vector that is of each parameter, in its shape; with `is_scalar` one number of each."""
+    """Return a view of a vector for each parameter, in its shape; with `is_scalar`, one number for each."""
     tensor = torch.from_numpy(vector)
     if is_scalar:
         return list(tensor.unbind())

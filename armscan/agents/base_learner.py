@@ -43,20 +43,20 @@ class BaseLearner(ABC):
         """Load what `weights` returned.
 
         Raises:
-            CheckpointError: If it is that of another network.
+            CheckpointError: If the weights belong to another network.
         """
         load_into(self._network, weights)
 
     @abstractmethod
     def _lr_groups(self) -> list[dict[str, Any]]:
-        """Return the parameter groups of the optimisers whose learning rate falls."""
+        """Return the parameter groups whose learning rate `_set_lr` changes."""
 
     def _set_lr(self, lr: float) -> None:
         for group in self._lr_groups():
             group["lr"] = lr
 
     def _epoch_seeds(self) -> list[np.random.SeedSequence]:
-        """Seed torch for an epoch, from before the first on; return three more seeds for other random numbers."""
+        """Seed torch for the current epoch (0: the warm-up); return three more seeds for other random numbers."""
         for_torch, *others = np.random.SeedSequence([self._seed, self._n_epochs]).spawn(4)
         torch.manual_seed(int(for_torch.generate_state(1)[0]))
         return others
@@ -65,8 +65,8 @@ class BaseLearner(ABC):
 class SupervisedLearner(BaseLearner):
     """Learner of one network, supervised with the labelled planes of the episodes.
 
-    Every epoch begins with new episodes and draws everything from `seed` and its own number, so that it continues from
-    its state bit for bit.
+    Every epoch begins with new episodes and seeds all random numbers with (`seed`, epoch), so that a learner resumes
+    from its state bit for bit.
 
     Args:
         network: Network to train, which the optimiser updates.
@@ -85,7 +85,7 @@ class SupervisedLearner(BaseLearner):
 
     @property
     def n_env_steps(self) -> int:
-        """Environment steps taken so far, the starts of episodes included."""
+        """Environment steps so far: the slices learned from, the starts of episodes included."""
         return self._n_env_steps
 
     def policy(self) -> Policy:
@@ -93,7 +93,7 @@ class SupervisedLearner(BaseLearner):
         return Policy(self._network, clip_action, self._compute)
 
     def warm_up(self) -> None:
-        """Do nothing: the first planes already count for learning."""
+        """Do nothing: the learner learns from the first plane on."""
 
     def learn(self, n_env_steps: int) -> dict[str, float]:
         """Learn for one epoch of at least `n_env_steps`; return its training metrics by name.
@@ -150,7 +150,7 @@ class SupervisedLearner(BaseLearner):
         """Restore what `state` returned.
 
         Raises:
-            CheckpointError: If it is that of another agent.
+            CheckpointError: If the state belongs to another agent.
         """
         self.load_weights(state["network"])
         self._optimiser.load_state_dict(state["optimiser"])
@@ -158,7 +158,7 @@ class SupervisedLearner(BaseLearner):
 
 
 def labelled_envs_of(envs: Any) -> ArmscanVectorEnv:
-    """Return the environments that tell a supervised learner the labelled planes."""
+    """Return the environments that give a supervised learner the labelled planes."""
     assert isinstance(envs.unwrapped, ArmscanVectorEnv), "only these say where the optimal planes lie"
     return envs.unwrapped
 
@@ -177,10 +177,10 @@ def diverged(n_env_steps: int, too_large: str = "agent.lr") -> DivergedError:
 
 
 def load_into(module: nn.Module, weights: dict[str, Any]) -> None:
-    """Give a network its weights.
+    """Load weights into a network.
 
     Raises:
-        CheckpointError: If they are those of another network.
+        CheckpointError: If they belong to another network.
     """
     try:
         module.load_state_dict(weights)
@@ -191,18 +191,18 @@ def load_into(module: nn.Module, weights: dict[str, Any]) -> None:
 def spare_dynamo() -> None:
     """Keep torch's optimisers from loading torch's compiler, which they do not use.
 
-    That takes one and a half seconds. Code that compiles must load it first.
+    Loading it takes one and a half seconds. Code that uses the compiler must load it first.
     """
     if "torch._dynamo" in sys.modules:
         return
     for method in vars(torch.optim.Optimizer).values():
-        # `torch._disable_dynamo` looks here for what its compiler has made of the method.
+        # `torch._disable_dynamo` looks up the compiler's version of the method here.
         if (plain := getattr(method, "__wrapped__", None)) is not None:
             vars(plain).setdefault("__dynamo_disable", plain)
 
 
 def prepare_torch(seed: int) -> None:
-    """Make torch compute on one thread, where small networks are fastest, and seed the networks made next."""
+    """Make torch compute on one thread, which is fastest for small networks, and seed the weights of new networks."""
     spare_dynamo()
     torch.set_num_threads(1)
     torch.manual_seed(seed)

@@ -1,4 +1,4 @@
-"""Agents that learn nothing and model nothing: random planes, and all planes one after another."""
+"""Non-learning baselines: random planes, and all planes in fixed steps."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class RandomAgent:
 
     def begin(self, *, seed: int, bounds: ActionBounds) -> None:
         """Begin an episode; its planes are drawn from the seed."""
-        # A child of it: the environment is often reset with the seed itself, and its volume's motion drawn from that.
+        # A child: the environment is often reset with the seed itself, and draws its volume's motion from that.
         (child,) = np.random.SeedSequence(seed).spawn(1)
         self._rng = np.random.default_rng(child)
 
@@ -50,22 +50,22 @@ class RandomAgent:
 class Exhaustive:
     """All planes in fixed steps, from the middle of the swept components' ranges outward.
 
-    The middle is a rotation of 0 and half the bound of a translation. Each plane is looked at once, the nearest to the
-    middle, counted in steps, first; of two equally near ones that with the smaller component. No plane lies between the
-    last step within the range and its end. Where all were seen and none ended the episode, the agent stays at the one
-    with the best reward.
+    The middle is a rotation of 0 and half the bound of a translation. Each plane is visited once, in order of its
+    distance from the middle, counted in steps; ties go to the smaller component. No plane lies between the last step
+    within the range and its end. If all planes were visited and none ended the episode, the agent stays at the one with
+    the best reward.
 
     Components that are free but not swept are held at 0 degrees or 0 mm: the plane straight across the arm with the
-    whole hand in the picture. (The middle of tx, normalised 0, would push half of the hand out of it.) It never stops
-    an episode by itself.
+    whole hand in the picture. (The middle of tx, normalised 0, would push half of the hand out of it.) The agent never
+    stops an episode by itself.
 
     Raises:
         InvalidValueError: If a value is impossible.
     """
 
     swept: Sequence[str] | None = ("ty",)
-    """Components to sweep, one or two. None: all free ones; more than two would take thousands of planes even in wide
-    steps.
+    """Components to sweep, one or two. None: all free ones, of which there must be at most two: more would take
+    thousands of planes even in wide steps.
     """
 
     step_mm: float = 5.0
@@ -122,8 +122,8 @@ class ExhaustiveAgent:
         self._n_looked_at = 0
 
     def act(self, observation: Observed, reward: float) -> FloatArray:
-        """Return the next plane, or the best one when all were seen, shape (n_action,)."""
-        # The first reward is the start's, which is none of these planes.
+        """Return the next plane, or the best one when all were visited, shape (n_action,)."""
+        # The first reward belongs to the start, which is none of these planes.
         if 0 < self._n_looked_at <= len(self._planes):
             self._rewards.append(reward)
         self._n_looked_at += 1
@@ -139,7 +139,7 @@ class ExhaustiveAgent:
         """
         # Half a component's range, counted in steps. The normalised middle is 0 for rotations and translations alike.
         halves = [self._half_range_steps(name, bounds) for name in self._swept]
-        # A step that ends on the range's end is within it, however the quotient was rounded.
+        # A step that ends at the range's end is within it, whatever the rounding of the quotient.
         n_each_side = [math.floor(half + 1e-9) for half in halves]
         if (n_planes := math.prod(2 * n + 1 for n in n_each_side)) > MAX_PLANES:
             raise InvalidValueError(

@@ -18,7 +18,7 @@ from armscan.utils.arrays import FloatArray
 
 @runtime_checkable
 class BatchAgent(Protocol):
-    """Agent that plays many episodes at once; its planes are, bit for bit, those of each episode played alone."""
+    """Agent that plays many episodes at once, each bit for bit as if it were played alone."""
 
     def begin_all(self, *, seeds: Sequence[int], bounds: Sequence[ActionBounds]) -> None:
         """Begin an episode for each seed; see `Agent.begin`."""

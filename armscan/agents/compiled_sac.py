@@ -1,4 +1,4 @@
-"""Tianshou's SAC with a compiled update, if its update can be compiled."""
+"""Tianshou's SAC, with a compiled update where possible."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from armscan.agents.mlp_kernels import Layers
 from armscan.agents.replay import Replay
 from armscan.utils.compilation import compilation_told
 
-# Gradient steps of one call: enough that calling costs little, few enough that an interrupt is heeded soon.
+# Gradient steps per compiled call: enough to amortise the call, few enough to react to an interrupt quickly.
 N_AT_ONCE = 16
 COMPILING = "compiling SAC's update for this machine, which takes ten seconds; later runs find it in the cache"
 
@@ -43,8 +43,8 @@ class UpdateStats(sac.SACTrainingStats):
 class CompiledSAC(sac.SAC[Any]):
     """Tianshou's SAC with compiled gradient steps, each of which replaces some 9,500 Python calls.
 
-    Batches and noise are drawn as Tianshou draws them, so that both updates agree but for rounding, and each can resume
-    from the other's state. Policy, buffer, collector, trainer and the format of the state are Tianshou's.
+    It draws batches and noise as Tianshou does, so both updates agree up to rounding, and each can resume from the
+    other's state. Policy, buffer, collector, trainer and the format of the state are Tianshou's.
 
     Args:
         compute: Device and precision of the tensors.
@@ -52,7 +52,7 @@ class CompiledSAC(sac.SAC[Any]):
         arguments: Keyword arguments of Tianshou's SAC.
 
     Attributes:
-        fallback_reason: Reason why Tianshou computes the updates; None if they are compiled.
+        fallback_reason: Reason why Tianshou's own update runs; None if the update is compiled.
     """
 
     def __init__(self, *, compute: Compute, replay: ReplayBuffer, **arguments: Any) -> None:
@@ -130,7 +130,7 @@ class CompiledSAC(sac.SAC[Any]):
 
 
 def fallback_reason(algorithm: sac.SAC[Any], compute: Compute, replay: ReplayBuffer) -> str | None:
-    """Return why the updates of an algorithm are left to Tianshou; None if they can be compiled."""
+    """Return why Tianshou's own update must run; None if the update can be compiled."""
     optimisers: list[Any] = [*algorithm._optimizers]
     entropy = [algorithm.alpha._optim] if isinstance(algorithm.alpha, sac.AutoAlpha) else []
     sizes = [layer_sizes(network) for network in (algorithm.policy.actor, algorithm.critic, algorithm.critic2)]
@@ -171,15 +171,15 @@ def layer_sizes(network: Any) -> list[int] | None:
 
 @functools.cache
 def _blas() -> ThreadpoolController:
-    """Return the control of BLAS's threads: small products are fastest on one, and then reproducible to the bit."""
-    # Its BLAS is the one that numba calls.
+    """Return the controller of BLAS's threads: on one, small products are fastest, and reproducible to the bit."""
+    # This loads the BLAS that numba calls.
     importlib.import_module("scipy.linalg.cython_blas")
     return ThreadpoolController().select(user_api="blas")
 
 
 @contextlib.contextmanager
 def _flushed_denormals() -> Iterator[None]:
-    """Let the processor flush denormal numbers to 0; Adam's averages for dead units become denormal, which is slow."""
+    """Flush denormal numbers to 0: Adam's moments for dead units become denormal, which is slow."""
     torch.set_flush_denormal(True)
     try:
         yield

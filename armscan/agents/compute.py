@@ -27,7 +27,7 @@ class Compute:
         compile: Whether to compile networks with `torch.compile`, which takes a minute and requires a C++ compiler.
 
     Raises:
-        InvalidValueError: If a value is unknown, or there is no such device here.
+        InvalidValueError: If a value is unknown, or torch finds no such device.
     """
 
     device: str = "auto"
@@ -72,7 +72,7 @@ def plain_copy(network: nn.Module) -> nn.Module:
     """Return a copy of a network that computes in 32 bits on the CPU, undoing `Compute.apply_to`."""
     import torch
 
-    # The copy of what was compiled is not.
+    # The copy of a compiled network is not compiled.
     copied = deepcopy(network)
     vars(copied).pop("forward", None)
     return copied.to("cpu", torch.float32)

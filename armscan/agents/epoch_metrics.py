@@ -34,7 +34,7 @@ class EpochMetrics(LazyLogger):
         self._values["train/length"].extend(log_data["lens"])
 
     def log_update_data(self, log_data: dict[str, Any], step: int) -> None:
-        """Gather losses and count gradient steps, of which many may be reported at once, by their means."""
+        """Gather losses and count gradient steps; one report may hold the means of several steps."""
         n_updates = log_data.get("gradient_steps", 1)
         self._n_updates += n_updates
         for theirs, ours in self.UPDATE_NAMES:

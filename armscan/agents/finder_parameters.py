@@ -44,12 +44,12 @@ class FinderParameters:
 
     n_averaged: int = 1
     """Number of latest looks whose estimates are averaged, weighted by the inverse squares of their expected errors; at
-    most the number of looks. Looks lie beside this mean, and the last plane is the mean. 1: the latest estimate alone.
-    The network is taught in the same way.
+    most the number of looks. The next look is placed beside their mean; the answer is the mean. 1: the latest estimate
+    alone, as always in training.
     """
 
     average_tilts: bool = True
-    """Whether tilts are averaged, too, or only distances, while the tilt is that of the latest look."""
+    """Whether to average tilts too. False: only distances; the tilt is the latest look's."""
 
     filters: Sequence[int] = (12, 24, 36)
     """Filters of each of the three convolutions."""
@@ -58,37 +58,34 @@ class FinderParameters:
     """Units of each layer after the convolutions."""
 
     sure_mm: float | None = None
-    """Expected error in mm below which, together with `sure_deg`, the agent takes no further looks. None: it takes all
-    looks.
-    """
+    """Largest expected error in mm at which, with `sure_deg`, the agent stops looking. None: it takes all looks."""
 
     sure_deg: float | None = None
-    """Expected error in degrees, see `sure_mm`; give both or none."""
+    """Expected error in degrees; see `sure_mm`. Give both or none."""
 
     lr: float = number(1.5e-3, above=0.0, at_most=1.0)
     """Learning rate of Adam."""
 
     lr_end_factor: float = number(0.02, at_least=0.0, at_most=1.0)
-    """Final learning rate as a fraction of `lr`, reached along half a cosine."""
+    """Final learning rate as a fraction of `lr`, reached by cosine decay."""
 
     num_envs: int = 48
-    """Number of episodes of one gradient step, which learns from all their looks."""
+    """Number of episodes in one gradient step, which learns from all their looks."""
 
     loss_mm: float = number(1.0, above=0.0, at_most=100.0)
-    """Error along the normal, in mm, from which on the loss grows linearly; five times as much for the first look."""
+    """Error along the normal, in mm, above which the smooth L1 loss is linear; five times this for the first look."""
 
     loss_deg: float = number(3.0, above=0.0, at_most=90.0)
-    """Error of the angle, in degrees, from which on the loss grows linearly; twice as much for the first look."""
+    """Angle error, in degrees, above which the smooth L1 loss is linear; twice as large for the first look."""
 
     loss_across_mm: float = number(6.0, above=0.0, at_most=100.0)
-    """Error of the slice's middle across, in mm, from which on the loss grows linearly."""
+    """Error across of the slice's middle, in mm, above which the smooth L1 loss is linear."""
 
     astray_share: float = number(0.3, at_least=0.0, at_most=1.0)
-    """Share of the training looks that are moved away at random, by up to some mm and degrees."""
+    """Share of the training looks that are perturbed at random, by some mm and degrees."""
 
     phantom_share: float | None = None
-    """Share of the training episodes on phantoms, if there are other volumes beside them. None: every volume is equally
-    frequent.
+    """Share of the training episodes on phantoms, if there are other volumes too. None: all volumes are equally likely.
     """
 
     def __post_init__(self) -> None:
@@ -123,11 +120,11 @@ class FinderParameters:
                 check_float(f"agent.{name}", limit, above=0.0)
 
     def lr_after(self, n_env_steps: int, total_env_steps: int) -> float:
-        """Return the learning rate after `n_env_steps`: half a cosine from `lr` to `lr_end_factor` times as much."""
+        """Return the learning rate after `n_env_steps`: cosine decay from `lr` to `lr_end_factor` times as much."""
         fall = 0.5 * (1.0 + math.cos(math.pi * min(1.0, n_env_steps / total_env_steps)))
         return self.lr * (self.lr_end_factor + (1.0 - self.lr_end_factor) * fall)
 
     @property
     def n_looks(self) -> int:
-        """Slices that an episode takes, the start included; the plane that it returns is not looked at."""
+        """Number of slices that the agent sees in an episode, the start included, its answer not."""
         return len(self.offsets_mm)

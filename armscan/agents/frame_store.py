@@ -1,4 +1,4 @@
-"""Frames of images in little memory: runs of pixels instead of pixels, and each frame once."""
+"""Store of image frames, run-length encoded and reference-counted."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from armscan.utils.compilation import cached_njit
 
 Pixels = NDArray[np.uint8]
 NO_FRAME = 0
-"""The id that stands for none, where a replay buffer has never been written to."""
+"""ID in slots of a replay buffer that were never written: no frame."""
 MAX_IN_A_BYTE, MAX_IN_TWO = np.uint64(255), np.uint64(65535)
 
 
 def encode(pixels: Pixels) -> bytes:
-    """Return a frame's runs of equal pixels; those of value 0 are left out, so that an empty frame takes nothing.
+    """Return a frame run-length encoded, without the runs of value 0, so that an empty frame takes no bytes.
 
-    Every three bytes are a run: pixels since the end of the one before, at most 255, its length, at most 255, and its
-    value; where the length is 0, they are a gap of the first byte's plus 256 times the third one's pixels. Where that
-    would take no fewer bytes than there are pixels, the pixels themselves are returned.
+    Three bytes describe a run: its distance from the end of the previous one (at most 255 pixels), its length (at most
+    255) and its value. If the length is 0, they describe a gap of (first byte + 256 * third byte) pixels.
+    If this takes no fewer bytes than there are pixels, the pixels themselves are returned.
 
     Args:
         pixels: Pixels of one frame, shape (n_pixels,).
@@ -33,17 +33,17 @@ def encode(pixels: Pixels) -> bytes:
 
 
 def decode(frames: list[bytes], n_pixels: int) -> Pixels:
-    """Return the pixels of frames that `encode` gave, shape (n, n_pixels), in one compiled call."""
+    """Return the pixels of frames that `encode` returned, shape (n, n_pixels), in one compiled call."""
     ends = np.cumsum(np.fromiter(map(len, frames), dtype=np.uint64, count=len(frames)))
     pixels = np.empty((len(frames), n_pixels), dtype=np.uint8)
     _decode(np.frombuffer(b"".join(frames), dtype=np.uint8), ends, pixels)
     return pixels
 
 
-# Positions are unsigned: indices that might be negative would cost more than all the rest.
+# Positions are unsigned: numba's handling of negative indices would cost more than all the rest.
 @cached_njit(nogil=True)
 def _encode(pixels: Pixels, buffer: Pixels) -> int:
-    """Write the runs; return how many bytes they are, the number of pixels where it would be as many or more."""
+    """Write the runs; return their number of bytes, or the number of pixels if they need at least as many."""
     n_pixels, n_bytes, i = np.uint64(pixels.size), np.uint64(0), np.uint64(0)
     one, two, three = np.uint64(1), np.uint64(2), np.uint64(3)
     while True:
@@ -70,7 +70,7 @@ def _encode(pixels: Pixels, buffer: Pixels) -> int:
 
 @cached_njit(nogil=True)
 def _decode(joined: Pixels, ends: NDArray[np.uint64], pixels: Pixels) -> None:
-    """Fill frames from their runs; `ends` says where each one's end in `joined`."""
+    """Decode frames into `pixels`; `ends` says where the bytes of each end in `joined`."""
     n_pixels, at = np.uint64(pixels.shape[1]), np.uint64(0)
     one, two, three = np.uint64(1), np.uint64(2), np.uint64(3)
     for k in range(len(ends)):
@@ -97,7 +97,7 @@ def _decode(joined: Pixels, ends: NDArray[np.uint64], pixels: Pixels) -> None:
 
 
 class FrameStore:
-    """Frames of `n_pixels` by ID, each for as long as something refers to it."""
+    """Frames of `n_pixels` by ID; each is dropped with its last reference."""
 
     def __init__(self, n_pixels: int) -> None:
         self._n_pixels = n_pixels
@@ -105,7 +105,7 @@ class FrameStore:
 
     def clear(self) -> None:
         """Forget every frame."""
-        # By id; the first stands for none.
+        # Indexed by ID; the first is `NO_FRAME`.
         self._frames = [b""]
         self._n_references = [0]
         self._free: list[int] = []
@@ -119,7 +119,7 @@ class FrameStore:
         return sum(map(len, self._frames))
 
     def add(self, pixels: Pixels) -> int:
-        """Store a frame, shape (n_pixels,); return its ID, which nothing refers to yet."""
+        """Store a frame, shape (n_pixels,), without references yet; return its ID."""
         frame = encode(pixels)
         if self._free:
             frame_id = self._free.pop()

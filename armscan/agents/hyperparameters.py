@@ -12,7 +12,7 @@ from armscan.utils.validation import check_bool, check_float, check_int
 
 
 def number(default: float, **limits: float) -> Any:
-    """Return a dataclass field of a number within limits, which are those of `check_float`."""
+    """Return a dataclass field for a number; `limits` are arguments of `check_float`."""
     return field(default=default, metadata={"limits": limits})
 
 
@@ -27,7 +27,7 @@ class Parameters:
     """
 
     SCHEDULABLE: ClassVar[tuple[str, ...]] = ("lr", "lr_end_factor", "batch_size")
-    """Keys that a schedule may change during a training: neither networks nor buffer sizes and environments."""
+    """Keys that a schedule may change during a training: not networks, buffer sizes or environments."""
 
     network: NetworkChoice
     """Network of the actor, and of the critics if the algorithm has critics."""
@@ -69,12 +69,12 @@ class PolicyParameters(Parameters):
 
 
 def round_up(n_env_steps: int, num_envs: int) -> int:
-    """Return the next multiple of the number of environments, which are only stepped all at once."""
+    """Round environment steps up to a multiple of the number of environments, which are only stepped all at once."""
     return -(-n_env_steps // num_envs) * num_envs
 
 
 def buffer_capacity(buffer_size: int, num_envs: int, setup: AgentSetup) -> int:
-    """Return the capacity of a buffer, in transitions: as configured, but at most those of the whole training."""
+    """Return the capacity of a buffer, in transitions: as configured, but no more than the whole training takes."""
     return min(buffer_size, setup.total_env_steps + num_envs)
 
 

@@ -1,4 +1,4 @@
-"""The replay buffer of observations with images: their frames are kept compressed, and each of them once."""
+"""Replay buffer for image observations: frames are compressed, and shared between stacks and steps."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from armscan.agents.replay import Added, Replay, Tree
 
 OBSERVATIONS = ("obs", "obs_next")
 Seen = list[tuple[bytes, int]]
-"""Pixels of frames with their ids."""
+"""Pixels of frames with their IDs."""
 
 
 def replay_for(observation_space: spaces.Space[Any], size: int, n_envs: int) -> Replay:
-    """Return the replay buffer that suits the observations: a plain one if there are no images among them."""
+    """Return the replay buffer for these observations: a plain one if they have no images."""
     images = images_of(observation_space)
     return ImageReplay(size, n_envs, images) if images else Replay(size, n_envs)
 
@@ -28,12 +28,12 @@ def replay_for(observation_space: spaces.Space[Any], size: int, n_envs: int) -> 
 class ImageReplay(Replay):
     """A `Replay` that stores IDs of frames instead of images, and returns the images unchanged.
 
-    An image of three axes or more is a row of frames along its first one, such as a stack; one of two axes is a single
-    frame. Most frames have been seen a moment ago: in the stack before, or as the next observation of the last step.
-    A frame is kept once for all of these, which is found by comparing pixels, so that nothing depends on how the
-    environment stacks. It is forgotten once the last transition that shows it is overwritten.
+    An image of three axes or more is a sequence of frames along its first axis, such as a stack; one of two axes is a
+    single frame. Most frames also occur in the previous stack, or in the next observation of the last step. They are
+    recognised by their pixels, whatever the environment's stacking, and stored once. A frame is dropped when the last
+    transition that shows it is overwritten.
 
-    Two batches of the same transitions, asked for one after the other, share the memory of their images.
+    Consecutive requests for the same transitions share the memory of their images.
 
     Args:
         size: Total number of transitions.
@@ -44,11 +44,11 @@ class ImageReplay(Replay):
     def __init__(self, size: int, n_envs: int, images: Mapping[str, spaces.Box]) -> None:
         super().__init__(size, n_envs)
         self._images = {name: _ImageStore(box.shape, n_envs) for name, box in images.items()}
-        # What was asked for last, by key and name, with the ids it was: an update asks for one batch twice.
+        # The latest request, by key and name: IDs and images. An update asks for each batch twice.
         self._last: dict[tuple[str, str], tuple[NDArray[np.int32], Pixels]] = {}
 
     def add(self, batch: Any, buffer_ids: Any = None) -> Added:
-        """Add a transition of each of these environments; default: of all."""
+        """See `Replay.add`."""
         envs = range(self.buffer_num) if buffer_ids is None else [int(i) for i in buffer_ids]
         slots = [self._offset[i] + self.buffers[i]._insertion_idx for i in envs]
         self._last.clear()
@@ -63,13 +63,13 @@ class ImageReplay(Replay):
             for k, key in enumerate(OBSERVATIONS):
                 ids[key][name] = np.array([of_transition[k] for of_transition in taken], dtype=np.int32)
         added = super().add({**dict(batch.items()), **ids}, buffer_ids)
-        # Only now: what was overwritten may be what has just been referred to anew.
+        # Only now: a new transition may refer to an overwritten frame.
         for name, images in self._images.items():
             images.frames.release(overwritten[name])
         return added
 
     def get(self, index: Any, key: str, default_value: Any = None, stack_num: int | None = None) -> Any:
-        """Return one part of transitions, with its images."""
+        """Return one part of transitions, with its images decoded."""
         found: Any = super().get(index, key, default_value, stack_num)
         if key not in OBSERVATIONS:
             return found
@@ -88,7 +88,7 @@ class ImageReplay(Replay):
     def cut_off(self) -> None:
         """See `Replay.cut_off`."""
         super().cut_off()
-        # Episodes begin anew; and what a resumed training does not know must not be used by one that just goes on.
+        # New episodes begin. A resumed training has no last frames, so an uninterrupted one must not use them either.
         for images in self._images.values():
             images.forget_last()
 
@@ -103,7 +103,7 @@ class ImageReplay(Replay):
             images.frames.load_state(state["frames"][name])
 
     def _ids(self, name: str, slots: list[int]) -> list[int]:
-        """Return the ids of all frames that transitions refer to, one for each reference."""
+        """Return the IDs of all frames that transitions refer to, one for each reference."""
         return [frame_id for key in OBSERVATIONS for frame_id in self._meta[key][name][slots].ravel().tolist()]
 
     def _decoded(self, key: str, name: str, ids: NDArray[np.int32]) -> Pixels:
@@ -116,7 +116,7 @@ class ImageReplay(Replay):
 
 
 class _ImageStore:
-    """The frames of one image part of the observations, images of one shape."""
+    """Frames of one image part of the observations, whose images have one shape."""
 
     def __init__(self, shape: tuple[int, ...], n_envs: int) -> None:
         self._shape = shape
@@ -142,7 +142,7 @@ class _ImageStore:
         return self.frames.decode(ids).reshape(*ids.shape[:-1], *self._shape)
 
     def _ids(self, frames: Pixels, seen: Seen) -> list[int]:
-        """Return the ids of the frames of an image, shape (n_frames, n_pixels), and add them to those seen."""
+        """Return the IDs of an image's frames, shape (n_frames, n_pixels), and add them to those seen."""
         first = len(seen)
         for frame in frames:
             pixels = frame.tobytes()

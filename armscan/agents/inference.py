@@ -1,7 +1,7 @@
-"""Actions of a Gaussian actor: many observations at once, each answered to the last bit as if it were alone.
+"""Actions of a Gaussian actor for many observations at once, each bit for bit as for that observation alone.
 
-torch adds up a batch of one in another order than a larger batch. Here a network of linear layers and ReLU goes row by
-row through the same compiled loop for every batch size; any other network computes one row at a time.
+torch sums a batch of one in another order than a larger batch. Here a compiled loop computes networks of linear layers
+and ReLU row by row, for every batch size; other networks compute one row at a time.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Bounded = Callable[[torch.Tensor], torch.Tensor]
 
 @cached_njit(nogil=True)
 def linear_rows(rows: Rows, weights: Rows, bias: Rows) -> Rows:
-    """Return `rows @ weights.T + bias`; each number is its bias plus the products, added in the order of the inputs.
+    """Return `rows @ weights.T + bias`; each number is its bias plus the products, summed in the order of the inputs.
 
     Args:
         rows: Inputs, shape (n, n_inputs).
@@ -42,17 +42,17 @@ def linear_rows(rows: Rows, weights: Rows, bias: Rows) -> Rows:
             sums[j] = bias[j]
         for k in range(by_input.shape[0]):
             value, of_input = rows[row, k], by_input[k]
-            # Many outputs at a time, which no sum is shared between.
+            # Vectorised over the outputs: the order within each sum stays.
             for j in range(sums.size):
                 sums[j] += value * of_input[j]
     return answers
 
 
 class Inference:
-    """Chooses an actor's actions without exploration, for the episodes that `begin` has begun.
+    """Chooses an actor's actions in evaluations, for the episodes that `begin` has begun.
 
     Args:
-        actor: Actor that returns mean and spread of the actions, with its weights at the time.
+        actor: Actor that returns mean and spread of the actions, with its current weights.
         bounded: Function that maps an action to [-1, 1].
         compute: Device and precision of the actor.
         is_sampling: Whether actions are drawn from mean and spread; all draws of an episode come from its own seed.
@@ -100,7 +100,7 @@ class Inference:
 
 
 def _layers_of(actor: nn.Module) -> list[nn.Module] | None:
-    """Return the layers of an actor's mean, None if they are not all linear or ReLU."""
+    """Return the layers that compute an actor's mean; None if they are not all linear or ReLU."""
     if type(actor) is not ContinuousActorProbabilistic or type(actor.preprocess) is not Net:
         return None
     layers = [*actor.preprocess.model.model, *actor.mu.model]

@@ -1,4 +1,4 @@
-"""The network of the plane finder: from several looks to the wanted plane and its expected error."""
+"""Network of the plane finder: predicts the labelled plane, and its own error, from several looks."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from torch import Tensor, nn
 
 from armscan.agents.plane_geometry import PlaneGeometry
 
-# Names of the parts of an observation that it takes.
+# Names of the parts of an observation that the network takes.
 IMAGE, ACTION = "shares", "action"
-# What the outputs are measured in: components of the normal, mm along it, mm across.
+# Units of the outputs: two components of the normal, mm along it, mm across.
 UNITS = (0.1, 0.05, 3.0, 8.0)
-# What the places of earlier looks are divided by, and how large they may become.
+# Units of the places of earlier looks, and the limit that they are clipped to.
 PLACES, MAX_PLACE = (0.2, 0.2, 10.0, 20.0), 6.0
-# No error is expected to be less, in mm and degrees: far below what is reached, and its logarithm is a number.
+# Lower bound of expected errors, in mm and degrees: far below real errors, and keeps their logarithm finite.
 MIN_EXPECTED = 0.01
 # Kernel of each convolution; all have stride 2.
 KERNELS = (5, 3, 3)
 
 
 class Estimate(NamedTuple):
-    """Estimate of the wanted plane, from the latest looks of n episodes.
+    """Estimate of the labelled plane, from the latest looks of n episodes.
 
     Attributes:
         plane: Plane of the latest look, shape (n, 4), in degrees and mm.
-        place: Place of the wanted plane in the frame of the latest look, shape (n, 4).
+        place: Place of the labelled plane in the frame of the latest look, shape (n, 4).
         expected: Expected errors of that place, in mm and degrees, shape (n, 2).
         step: Number of the latest look, one-hot, shape (n, n_looks).
         hidden: Features that the place was computed from, shape (n, n_hidden).
@@ -41,7 +41,7 @@ class Estimate(NamedTuple):
     hidden: Tensor
 
     def moved(self, offsets: Tensor) -> Estimate:
-        """Return the estimate with the place of the wanted plane moved, in the frame of the latest look."""
+        """Return the estimate with its place moved by `offsets`, in the frame of the latest look."""
         return self._replace(place=self.place + offsets)
 
     def features(self) -> Tensor:
@@ -58,10 +58,10 @@ class PlaneModule(Protocol):
 
     @property
     def calibration(self) -> Tensor:
-        """Factors of the expected errors, in mm and degrees, shape (2,)."""
+        """Calibration factors of the expected errors in mm and in degrees, shape (2,)."""
 
     def estimate(self, observations: dict[str, Tensor]) -> Estimate:
-        """Return the estimate of the latest look, from observations, whose parts have the shape (n, n_looks, ...)."""
+        """Return the estimate at the latest look, from observations with parts of shape (n, n_looks, ...)."""
 
     def __call__(self, observations: dict[str, Tensor]) -> tuple[tuple[Tensor, Tensor], None]:
         """Return the next actions, shape (n, n_action), and the expected errors of the planes found so far, (n, 2)."""
@@ -70,7 +70,7 @@ class PlaneModule(Protocol):
 class LookNetwork(nn.Module):
     """Convolutions over the images of the latest looks, then linear layers that also take the places of these looks.
 
-    One head predicts the place of the wanted plane in the frame of the latest look, as `PlaneGeometry.seen_from`
+    One head predicts the place of the labelled plane in the frame of the latest look, as `PlaneGeometry.seen_from`
     defines it. The other predicts the error of that place, in mm and degrees; its gradient does not reach the features.
 
     Args:
@@ -108,7 +108,7 @@ class LookNetwork(nn.Module):
         sizes = pairwise([n_features, *hidden_sizes])
         self.linear = nn.Sequential(*chain.from_iterable((nn.Linear(*each), nn.ReLU()) for each in sizes))
         self.place = nn.Linear(hidden_sizes[-1], 4)
-        # Checkpoints have this name.
+        # This name is part of checkpoints.
         self.doubt = nn.Sequential(nn.Linear(hidden_sizes[-1], 32), nn.ReLU(), nn.Linear(32, 2))
         self.register_buffer("units", torch.tensor(UNITS))
         self.register_buffer("places", torch.tensor(PLACES))
@@ -116,10 +116,10 @@ class LookNetwork(nn.Module):
     def forward(
         self, images: Tensor, actions: Tensor, step: Tensor, geometry: PlaneGeometry
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the place of the wanted plane, the expected errors, both above 0, and the features of both.
+        """Return the place of the labelled plane, its expected errors, both above 0, and the features of both.
 
         Args:
-            images: Looks of an episode from the oldest on, bytes of shape (n, n_looks, tissues, across, depth).
+            images: Looks of an episode, oldest first, bytes of shape (n, n_looks, tissues, across, depth).
             actions: Planes of the looks, normalised, shape (n, n_looks, 4).
             step: Number of the latest look, one-hot, shape (n, n_looks).
             geometry: Free components and bounds of the planes, in degrees and mm.
@@ -142,17 +142,17 @@ class LookNetwork(nn.Module):
 class FinderModule(nn.Module):
     """Network of a plane finder: maps observations of several looks to the next plane.
 
-    Which look of the episode the latest is follows from the stack of observations: it is filled with the first one.
+    The number of the latest look follows from the stack of observations, which is padded with the first one.
 
     Args:
         network: Network for the looks.
         geometry: Free components and bounds of the planes, in degrees and mm.
         offsets_mm: Offset of the next look along the normal from the plane found so far, in mm, after each look; the
             last is 0.
-        sure: Expected errors, in mm and degrees, below which it takes no further looks. None: it takes all looks.
+        sure: Largest expected errors, in mm and degrees, at which it stops looking. None: it takes all looks.
         n_averaged: Number of latest looks whose estimates are averaged, weighted by the inverse squares of their
             expected errors.
-        average_tilts: Whether tilts are averaged, too, or only distances.
+        average_tilts: Whether to average tilts too, or only distances.
         has_stop: Whether actions end with the component `stop`, as with `env.ends=on_stop`.
     """
 
@@ -181,16 +181,16 @@ class FinderModule(nn.Module):
 
     @property
     def n_features(self) -> int:
-        """Number of the features of an estimate."""
+        """Number of features of an estimate."""
         return self.network.place.in_features + 4 + 2 + len(self.offsets)
 
     def estimate(self, observations: dict[str, Tensor]) -> Estimate:
-        """Return the estimate of the latest look, from observations, whose parts have the shape (n, n_looks, ...)."""
+        """Return the estimate at the latest look, from observations with parts of shape (n, n_looks, ...)."""
         actions = observations[ACTION][:, :, :4]
         n_looks = actions.shape[1]
         is_first = (actions == actions[:, :1]).all(2).float()
         latest = torch.arange(n_looks, device=actions.device)
-        # Numbers of looks that equal the first, up to each one: as many as there are up to there, at the beginning.
+        # Number of looks up to each one that equal the first; at the leading copies of it, all of them do.
         n_equal = is_first @ (latest[:, None] <= latest).float()
         n_first = (n_equal == latest + 1.0).sum(1)
         step = ((n_looks - n_first)[:, None] == latest).float()
@@ -198,7 +198,7 @@ class FinderModule(nn.Module):
         return Estimate(self.geometry.planes(actions[:, -1]), place, expected * self.calibration, step, hidden)
 
     def found(self, observations: dict[str, Tensor]) -> Estimate:
-        """Return the estimate of the latest look, its place averaged over the estimates of the latest looks."""
+        """Return the estimate at the latest look, its place averaged over the latest `n_averaged` estimates."""
         n_averaged = self._n_averaged
         if n_averaged == 1:
             return self.estimate(observations)
@@ -215,9 +215,9 @@ class FinderModule(nn.Module):
         return latest._replace(place=place)
 
     def _latest(self, observations: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return what was observed after the latest look, then one look earlier, and so on, shape (n_averaged n, ...).
+        """Return the observations after the latest look, the one before it, and so on, shape (n_averaged * n, ...).
 
-        Before the first look there is the first again.
+        Before the first look, the first is repeated.
         """
         looks = [{name: observations[name] for name in (IMAGE, ACTION)}]
         for _ in range(1, self._n_averaged):

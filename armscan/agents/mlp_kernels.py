@@ -1,6 +1,6 @@
 """Fully connected networks with ReLU and Adam, compiled: BLAS for products, loops for the rest.
 
-Everything is float32 and changed in place. The weights of a network are one vector: for each layer its weights, shape
+Everything is float32 and updated in place. A network's weights are one vector: for each layer its weights, shape
 (n_out, n_in), then its biases; one head or more follow the hidden layers.
 """
 
@@ -18,19 +18,19 @@ from armscan.utils.compilation import cached_njit
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
 F = np.float32
-# Most multiplications of a product for which OpenBLAS has faster kernels; it has them for processors with AVX-512.
+# Largest matrix product, in multiplications, for which OpenBLAS has faster kernels; only with AVX-512.
 N_SMALL = 10**6 if get_host_cpu_features().get("avx512f") else 0
-# Rows that are multiplied at once where a product is small then.
+# Rows multiplied at once, if that makes the product small.
 N_ROWS = 64
-# Arrays are copied by loops: at an assignment to a slice, Numba compiles the text of its shape error, for two seconds.
-# Sums may be reordered, so that loops over them are vectorised. NaN stays NaN: a training that diverges must show it.
+# Loops copy arrays: for a slice assignment, Numba would also compile its shape error's text, which takes two seconds.
+# Sums may be reordered, so that their loops are vectorised. NaN stays NaN, so that divergence shows.
 fast_njit = cached_njit(
     nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz", "arcp"}, boundscheck=False
 )
 
 
 class Weights(NamedTuple):
-    """Weights of a network, their gradient, and Adam's state; shape (n,), `steps` (1 or more,)."""
+    """Weights of a network, their gradient, and Adam's state, shape (n,); `steps` has shape (n_parameters,)."""
 
     values: Floats
     gradient: Floats
@@ -72,7 +72,7 @@ def is_small(b: Floats) -> bool:
 
 @fast_njit
 def product(a: Floats, b: Floats, out: Floats) -> None:
-    """Fill `out`, shape (n, m), with `a @ b`, shapes (n, k) and (k, m), in small parts if possible."""
+    """Fill `out`, shape (n, m), with `a @ b`, shapes (n, k) and (k, m), by blocks of rows if those are small."""
     n_rows = N_ROWS if is_small(b) else a.shape[0]
     for start in range(0, a.shape[0], n_rows):
         np.dot(a[start : start + n_rows], b, out[start : start + n_rows])
@@ -80,7 +80,7 @@ def product(a: Floats, b: Floats, out: Floats) -> None:
 
 @fast_njit
 def linear(x: Floats, weights: Floats, start: int, out: Floats, is_hidden: bool) -> int:
-    """Fill a layer's values, of a hidden one after ReLU; returns where the next layer's weights start."""
+    """Compute a layer's values, with ReLU if it is hidden; return where the next layer's weights start."""
     n_out: int = out.shape[1]
     end: int = start + n_out * x.shape[1]
     columns = weights[start:end].reshape(n_out, x.shape[1]).T
@@ -99,7 +99,7 @@ def linear(x: Floats, weights: Floats, start: int, out: Floats, is_hidden: bool)
 
 @fast_njit
 def linear_gradient(x: Floats, d_out: Floats, gradient: Floats, start: int) -> None:
-    """Fill the gradient of a layer's weights."""
+    """Compute the gradient of a layer's weights and biases."""
     n_out, end = d_out.shape[1], start + d_out.shape[1] * x.shape[1]
     np.dot(d_out.T, x, gradient[start:end].reshape(n_out, x.shape[1]))
     d_bias = gradient[end : end + n_out]
@@ -111,14 +111,14 @@ def linear_gradient(x: Floats, d_out: Floats, gradient: Floats, start: int) -> N
 
 @fast_njit
 def input_gradient(d_out: Floats, weights: Floats, start: int, d_x: Floats) -> None:
-    """Fill the gradient of a layer's input."""
+    """Compute the gradient of a layer's input."""
     n_out, n_in = d_out.shape[1], d_x.shape[1]
     product(d_out, weights[start : start + n_out * n_in].reshape(n_out, n_in), d_x)
 
 
 @fast_njit
 def forward(weights: Floats, layers: Layers, n_rows: int) -> int:
-    """Fill the hidden layers; returns where the weights of the first head start."""
+    """Compute the hidden layers; return where the weights of the first head start."""
     start: int = 0
     for which in range(1, layers.sizes.size):
         out = layer_view(layers.values, layers.sizes, n_rows, which)
@@ -128,7 +128,7 @@ def forward(weights: Floats, layers: Layers, n_rows: int) -> int:
 
 @fast_njit
 def backward(weights: Weights, layers: Layers, n_rows: int, start: int, of_input: bool) -> None:
-    """Fill the gradient of the input, or else of all hidden layers' weights, from that of the last layer's values."""
+    """Backpropagate the gradient of the last layer's values to the input, or else to all hidden layers' weights."""
     for which in range(layers.sizes.size - 1, 0, -1):
         x = layer_view(layers.values, layers.sizes, n_rows, which - 1)
         out = layer_view(layers.values, layers.sizes, n_rows, which)
@@ -146,7 +146,7 @@ def backward(weights: Weights, layers: Layers, n_rows: int, start: int, of_input
 
 @fast_njit
 def adam_step(weights: Weights, settings: Adam) -> None:
-    """Take a step of Adam, as torch's."""
+    """Take an Adam step, as torch does."""
     for i in range(weights.steps.size):
         weights.steps[i] += F(1.0)
     n_steps = weights.steps[0]

@@ -1,4 +1,4 @@
-"""The network for observations with images: convolutions for these, linear layers for the vectors beside them."""
+"""Network for observations with images: convolutions for the images, linear layers for the vectors."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ if TYPE_CHECKING:
 
 
 class Multimodal:
-    """Convolutions for the images, linear layers for the vectors beside them, and a head for both together.
+    """Convolutions for the images, linear layers for the vectors, and a head for both together.
 
     Images: three convolutions (8 x 8 stride 4, 4 x 4 stride 2, 3 x 3 stride 1), ReLU after each, flattened; stacked
     frames are channels. Vectors (action, reward, memory, clusters, and for a critic the action it judges): two linear
-    layers. Head: two more linear layers, and the output. As in the published work, with 32, 64 and 64 filters and 512
-    units, after the network of Mnih et al. 2015 (doi:10.1038/nature14236).
+    layers. Head: two more linear layers, and the output. The default sizes are those of the published work, after the
+    network of Mnih et al. 2015 (doi:10.1038/nature14236).
 
     Args:
         filters: Number of filters of each convolution.
         vector_sizes: Units of each layer for the vectors.
-        head_sizes: Units of each layer of the head but the output.
+        head_sizes: Units of each hidden layer of the head.
 
     Raises:
         InvalidValueError: If a size is not a whole number of at least 1.
@@ -92,7 +92,7 @@ class Multimodal:
         return init_linear(MultimodalCritic(self.body(observation_space, n_action)))
 
     def body(self, observation_space: spaces.Space[Any], n_action: int = 0) -> MultimodalBody:
-        """Return all of the network but its output, of a critic of actions with `n_action` components."""
+        """Return the network without its output layer; for a critic, `n_action` is the number of action components."""
         from armscan.agents.multimodal_modules import MultimodalBody
 
         sizes = {"filters": self.filters, "vector_sizes": self.vector_sizes, "head_sizes": self.head_sizes}

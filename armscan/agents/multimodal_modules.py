@@ -17,14 +17,14 @@ from armscan.agents.convolutions import CONVOLUTIONS, count_features, images_of
 
 
 class MultimodalBody(ModuleWithVectorOutput):
-    """All of the network but its output.
+    """The network without its output layer.
 
     Args:
         space: Space of the observations.
         n_action: Number of components of the action that a critic judges; 0 for an actor.
         filters: Number of filters of each convolution.
         vector_sizes: Units of each layer for the vectors.
-        head_sizes: Units of each layer of the head but the output.
+        head_sizes: Units of each hidden layer of the head.
     """
 
     def __init__(
@@ -62,14 +62,14 @@ class MultimodalBody(ModuleWithVectorOutput):
         features = [self.vector(torch.cat(flat, dim=1))]
         for name, convolutions in self.convolutions.items():
             image = torch.as_tensor(obs[name], device=device)
-            # Frames, and a channel for each tissue, side by side as channels.
+            # Stacked frames, and their channels for the tissues, all become channels.
             frames = image.reshape(image.shape[0], -1, *image.shape[-2:]).float() * self._scales[name]
             features.append(convolutions(frames))
         return self.head(torch.cat(features, dim=1)), state
 
 
 class MultimodalCritic(nn.Module):
-    """A critic of observations, or of observations with actions: a body and its output."""
+    """A critic of observations, or of observations with actions: a body and an output layer."""
 
     def __init__(self, body: MultimodalBody) -> None:
         super().__init__()

@@ -12,7 +12,7 @@ from torch import nn
 
 
 def mlp_body(space: spaces.Space[Any], hidden_sizes: list[int], activation: str, n_action: int = 0) -> Net:
-    """Return fully connected layers for flat observations, and beside them actions with `n_action` components.
+    """Return fully connected layers for flat observations, concatenated with actions of `n_action` components.
 
     Args:
         space: Space of one observation.
@@ -48,7 +48,7 @@ def gaussian_actor(body: ModuleWithVectorOutput, n_action: int, log_std: float |
 
 
 def init_linear(module: nn.Module) -> nn.Module:
-    """Initialise linear layers with orthogonal weights and no bias; return the module."""
+    """Initialise linear layers with orthogonal weights and zero biases; return the module."""
     for layer in module.modules():
         if isinstance(layer, nn.Linear):
             nn.init.orthogonal_(layer.weight, gain=2**0.5)

@@ -16,26 +16,26 @@ if TYPE_CHECKING:
     from torch import nn
 
 
-# An actor and two critics, their lagging copies and the moments of their optimisers take 14 times a network's weights,
-# which is then 4 GB.
+# An actor, two critics and two target critics, with gradients and Adam's moments, take 14 times a network's weights: at
+# most 4 GB.
 MAX_UNITS, MAX_WEIGHTS = 16_384, 2**26
-# By the name of each, the layer of torch.nn.
+# Layers of torch.nn, by the names in the configuration.
 ACTIVATIONS = {"relu": "ReLU", "tanh": "Tanh", "elu": "ELU", "gelu": "GELU"}
 
 
 class NetworkChoice(Protocol):
-    """Chooses the network by the observation."""
+    """Chooses a network that fits the observation space."""
 
     def for_space(self, observation_space: spaces.Space[Any]) -> Network:
         """Return the network for such observations; a network returns itself, if it can take them.
 
         Raises:
-            InvalidValueError: If none can; the reason is said.
+            InvalidValueError: If none can; the message says why.
         """
 
 
 class Network(NetworkChoice, Protocol):
-    """A kind of network that can be an actor's and a critic's."""
+    """A kind of network for actors and critics."""
 
     def actor(self, observation_space: spaces.Space[Any], n_action: int, log_std: float | None) -> Actor:
         """Return a Gaussian actor.
@@ -92,7 +92,7 @@ class MLP:
 
 
 class NetworkByObservation:
-    """The network that fits the observation: one for vectors, one for those with images.
+    """Chooses one network for vectors, and another one for observations with images.
 
     Args:
         vector: Network for an observation that is one vector.

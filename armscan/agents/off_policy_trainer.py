@@ -29,14 +29,14 @@ class EvenUpdatesTrainer(OffPolicyTrainer):
         self._learning_starts = learning_starts
 
     def _update_step(self, collect_stats: CollectStatsBase) -> TrainingStats:
-        """Take the gradient steps that are due since the collection before; return figures of them."""
+        """Take the gradient steps that are due since the last collection; return their statistics."""
         collector = self.params.training_collector
         n_env_steps = collector.collect_step - self._learning_starts
         n_due = self._n_due(n_env_steps) - self._n_due(n_env_steps - collect_stats.n_collected_steps)
         stats = TrainingStats()
         if n_due and self.algorithm.fallback_reason is None:
             stats = self.algorithm.update_repeatedly(collector.buffer, self.params.batch_size, n_due)
-            # Tianshou copies them deeply, and smooths losses for its progress bar.
+            # Tianshou's own method deep-copies the statistics, and smooths losses for its progress bar.
             self._logger.log_update_data(vars(stats), self._current_update_step)
             return stats
         for _ in range(n_due):
@@ -47,5 +47,5 @@ class EvenUpdatesTrainer(OffPolicyTrainer):
         return {}
 
     def _n_due(self, n_env_steps: int) -> int:
-        # Rounded: products that are whole come out as just below it here and there.
+        # Rounded, because a whole product may come out just below its value.
         return round(self.params.update_step_num_gradient_steps_per_sample * n_env_steps)

@@ -25,8 +25,8 @@ class OptunaSearch:
     """Search for the plane with an Optuna sampler, which sees only the rewards of the planes it has proposed.
 
     Each episode is a new study in memory. The reward of the start is not passed on, because no agent is told which
-    plane the start is. The named sampler proposes every plane, also with one free component: CMA-ES accepts a single
-    dimension, for which earlier versions of Optuna drew random planes.
+    plane the start is. The named sampler proposes every plane, even with one free component, for which CMA-ES in
+    earlier versions of Optuna fell back to random planes.
 
     Raises:
         InvalidValueError: If a value is impossible.
@@ -50,7 +50,7 @@ class OptunaSearch:
         # Deferred, here and below: only a search with Optuna needs this slow import.
         import optuna
 
-        # Optuna prints a line for every study, so for every episode, and warns that the GP sampler has no accelerator.
+        # Optuna logs a line for every study, so for every episode, and warns that the GP sampler has no accelerator.
         optuna.logging.set_verbosity(optuna.logging.ERROR)
         return OptunaAgent(setup.action_names, self)
 
@@ -63,7 +63,7 @@ class OptunaAgent:
         self._search = search
 
     def begin(self, *, seed: int, bounds: ActionBounds) -> None:
-        """Begin a study; all that its sampler draws comes from the seed."""
+        """Begin a study, with a sampler seeded with `seed`."""
         import optuna
 
         self._study = optuna.create_study(direction="maximize", sampler=_sampler(self._search, seed))
@@ -80,7 +80,7 @@ class OptunaAgent:
 def _sampler(search: OptunaSearch, seed: int) -> BaseSampler:
     from optuna.samplers import CmaEsSampler, GPSampler, TPESampler
 
-    # Each sampler has a number of its own where none is given.
+    # Without a number, each sampler uses its own default.
     startup: dict[str, Any] = {} if search.n_startup_trials is None else {"n_startup_trials": search.n_startup_trials}
     if search.sampler == "cmaes":
         return CmaEsSampler(seed=seed, warn_independent_sampling=False, **startup)

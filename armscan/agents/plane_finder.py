@@ -16,7 +16,7 @@ from armscan.errors import InvalidValueError
 if TYPE_CHECKING:
     from armscan.agents.plane_finder_learner import PlaneFinderLearner
 
-# Parts of the observation that it takes, and what the choice of one is called.
+# Parts of the observation that the agent requires, and the option that provides each.
 PARTS = {"shares": "obs=slice_metric", "action": "env.flat=null or false"}
 
 
@@ -24,11 +24,11 @@ PARTS = {"shares": "obs=slice_metric", "action": "env.flat=null or false"}
 class PlaneFinder(FinderParameters):
     """Network that predicts the labelled plane from the images of the latest looks of an episode.
 
-    One slice does not hold the last millimetre; slices on either side of the plane do. So each look but the last is
-    `offsets_mm` beside the plane as it has been found so far, along its normal, and the last plane is the one found.
-    The network is taught with the labelled planes of the training volumes, on the looks that it comes to by itself, as
-    in DAgger (Ross et al. 2011, arXiv:1011.0686), some of them led astray. A second head says how far off the plane is
-    expected to be, in mm and degrees; it is scaled to be right on average on the validation volumes.
+    One slice does not show where the plane lies to the millimetre; slices on either side of it do. So each look after
+    the start is offset from the plane found so far by `offsets_mm` along its normal, and the last step takes the plane
+    found. The network is trained with the labelled planes of the training volumes, on the looks that it chooses itself,
+    as in DAgger (Ross et al. 2011, arXiv:1011.0686), some of them perturbed. A second head predicts the plane's error,
+    in mm and degrees; it is calibrated on the validation volumes, to be right on average.
 
     Raises:
         InvalidValueError: If a value is impossible.
@@ -38,7 +38,7 @@ class PlaneFinder(FinderParameters):
         """Make an agent that has learned nothing yet.
 
         Raises:
-            InvalidValueError: If the environment does not show or allow what it needs, or the training is too short.
+            InvalidValueError: If the observations or actions do not fit, or the training is too short.
         """
         self.check(setup)
         import_tianshou()
@@ -64,7 +64,7 @@ class PlaneFinder(FinderParameters):
 
 
 def check_observed(space: spaces.Space[Any], n_looks: int) -> None:
-    """Raise `InvalidValueError` if observations are not stacks of as many looks, with images and actions."""
+    """Raise `InvalidValueError` unless observations are stacks of images and actions of `n_looks` looks."""
     parts = space.spaces if isinstance(space, spaces.Dict) else {}
     for part, choice in PARTS.items():
         if part not in parts:

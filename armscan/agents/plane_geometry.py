@@ -12,17 +12,17 @@ from armscan.envs.actions import ActionBounds
 from armscan.envs.rules import ON_REWARD, Rules
 from armscan.errors import InvalidValueError, listed
 
-# No plane is tilted further out of the frame of another than this sine, nor lies further across.
+# Limits of a plane in the frame of another: sine of its tilt, and position across in mm.
 MAX_TILT, MAX_ACROSS_MM = 0.98, 60.0
 TINY = 1e-6
 
 
 class PlaneGeometry(nn.Module):
-    """Planes (rz, rx, tx, ty) in degrees and mm, of slices with one middle and within one set of bounds.
+    """Planes (rz, rx, tx, ty) in degrees and mm, whose slices share one middle and one set of bounds.
 
-    In the frame of another plane (across, along its normal, in depth), a plane is four numbers: the two components of
-    its normal that lie in that plane, the way to it along its normal from the middle of that plane's slice in mm, and
-    where across the middle of its own slice lies, in mm.
+    In the frame of a reference plane (across, along its normal, in depth), a plane is four numbers: the two components
+    of its normal that lie in the reference plane; its distance from the middle of the reference slice, along its own
+    normal, in mm; and the position across of its own slice's middle, in mm.
 
     Args:
         bounds: Ranges of the components, in degrees and mm.
@@ -55,8 +55,8 @@ class PlaneGeometry(nn.Module):
         return _matrices(planes) @ self.middle + _origins(planes)
 
     def seen_from(self, planes: Tensor, others: Tensor) -> Tensor:
-        """Return where `others` lie in the frames of planes, shape (n, 4)."""
-        # Once for each: small operations of torch are most of a decision's time.
+        """Return where `others` lie in the frames of `planes`, shape (n, 4)."""
+        # Each matrix is computed once: torch's small operations take most of a decision's time.
         matrices, matrices_of_others, origins = _matrices(planes), _matrices(others), _origins(planes)
         normals, middles = matrices_of_others[:, :, 1], matrices_of_others @ self.middle + _origins(others)
         local = _turned_back(matrices, normals)
@@ -67,18 +67,18 @@ class PlaneGeometry(nn.Module):
         return torch.cat([local[:, :1], local[:, 2:], way, across], dim=1)
 
     def from_frame(self, planes: Tensor, seen: Tensor, beside_mm: Tensor) -> Tensor:
-        """Return the planes that lie at `seen` in the frames of planes, moved along their normals; shape (n, 4).
+        """Return the planes that lie at `seen` in the frames of `planes`, moved along their normals; shape (n, 4).
 
         Args:
-            planes: Planes, shape (n, 4).
-            seen: Offsets and angles in the frame of the planes, shape (n, 4); see `seen_from`.
+            planes: Reference planes, shape (n, 4).
+            seen: Planes in the frames of the reference planes, shape (n, 4); see `seen_from`.
             beside_mm: Offset along the normals, in mm, shape (n,).
         """
         tilt = seen[:, :2]
         tilt = tilt * (MAX_TILT / tilt.norm(dim=1, keepdim=True).clamp(min=MAX_TILT))
         upright = (1.0 - (tilt**2).sum(1, keepdim=True)).clamp(min=TINY).sqrt()
         local = torch.cat([tilt[:, :1], upright, tilt[:, 1:]], dim=1)
-        # From the nearest point of the plane on, along the axis across as it lies in the plane.
+        # Start at the nearest point of the plane, and move along the projection of the across axis onto it.
         step = torch.eye(3, dtype=seen.dtype, device=seen.device)[0] - local * local[:, :1]
         way = seen[:, 2:3] + beside_mm[:, None]
         across = seen[:, 3:4].clamp(-MAX_ACROSS_MM, MAX_ACROSS_MM) - way * local[:, :1]
@@ -87,7 +87,7 @@ class PlaneGeometry(nn.Module):
         return self.through(_turned(matrices, local), _turned(matrices, points) + _origins(planes))
 
     def through(self, normals: Tensor, points: Tensor) -> Tensor:
-        """Return planes with these normals through these points, their slices' middles beside them; shape (n, 4).
+        """Return planes with these normals, their slices centred across on these points, shape (n, 4).
 
         Rotations are clipped to the bounds; origins slide along the plane into them.
         """
@@ -97,7 +97,7 @@ class PlaneGeometry(nn.Module):
         rotations = torch.minimum(torch.maximum(torch.stack([rz, rx], 1), -self.bounds[:2]), self.bounds[:2])
         matrices = _matrices(torch.cat([rotations, torch.zeros_like(rotations)], dim=1))
         across, normal = matrices[:, :2, 0], matrices[:, :, 1]
-        # The origin (tx, ty, 0) lies in the plane, and as far across from the point as the slice's middle is.
+        # The origin (tx, ty, 0) lies in the plane, `middle[0]` across from the point.
         height = (normal * points).sum(1)
         place = (across * points[:, :2]).sum(1) - self.middle[0]
         determinant = across[:, 0] * normal[:, 1] - across[:, 1] * normal[:, 0]
@@ -106,7 +106,7 @@ class PlaneGeometry(nn.Module):
         return torch.cat([rotations, self._slid(torch.stack([tx, ty], 1), across)], dim=1)
 
     def _slid(self, origins: Tensor, across: Tensor) -> Tensor:
-        """Slide origins along their planes into the bounds, by the shortest way, as `shift_into` does."""
+        """Slide origins along their planes into the bounds, as little as possible, as `shift_into` does."""
         step = torch.where(across.abs() < TINY, TINY, across)
         ends = torch.stack([-origins / step, (self.bounds[2:] - origins) / step])
         lowest, highest = ends.amin(0).amax(1), ends.amax(0).amin(1)
@@ -115,7 +115,7 @@ class PlaneGeometry(nn.Module):
         return torch.minimum(slid.clamp(min=0.0), self.bounds[2:])
 
     def errors(self, planes: Tensor, optima: Tensor) -> Tensor:
-        """Return how far planes are from the optimal ones, in mm and degrees, shape (n, 2); see `plane_distance`."""
+        """Return how far planes are from the labelled ones, in mm and degrees, shape (n, 2); see `plane_distance`."""
         normals = self.normals(optima)
         way = ((self.middles(planes) - self.middles(optima)) * normals).sum(1).abs()
         cross = torch.linalg.cross(self.normals(planes), normals).norm(dim=1)
@@ -123,12 +123,12 @@ class PlaneGeometry(nn.Module):
 
 
 def common_geometry(rules: Rules, n_looks: int) -> PlaneGeometry:
-    """Return the geometry of planes on all volumes of environments in which an agent takes `n_looks` looks.
+    """Return one geometry for all volumes of environments in which an agent takes `n_looks` looks.
 
-    Slices of other sizes are seen about their own middle, so that the mean of the middles serves all of them.
+    Observations are centred on their slice's middle, so the mean middle serves slices of all sizes.
 
     Raises:
-        InvalidValueError: If that differs between volumes, or an episode may end before all looks are taken.
+        InvalidValueError: If the bounds differ between volumes, or an episode may end before all looks are taken.
     """
     if rules.ends == ON_REWARD or rules.max_steps < n_looks:
         raise InvalidValueError(

@@ -23,7 +23,7 @@ class Policy(nn.Module):
     Args:
         actor: Actor that returns mean and spread of the actions.
         bounded: Function that maps the mean to [-1, 1], as the learner does when it acts.
-        compute: Device and precision that the learner computes with.
+        compute: Device and precision of the learner.
         is_sampling: Whether the learner draws its actions from mean and spread, in evaluations too.
     """
 
@@ -50,12 +50,12 @@ class Policy(nn.Module):
 
 
 def clip_action(mean: torch.Tensor) -> torch.Tensor:
-    """Return a mean as a policy has it that is bounded by clipping."""
+    """Clip the mean of actions to [-1, 1]."""
     return mean.clamp(-1.0, 1.0)
 
 
 def batch_of(observations: Sequence[Observed]) -> Batch:
-    """Return single observations, one of them at least, as one batch of tensors."""
+    """Return one or more single observations as one batch of tensors."""
     parts = [parts_of(observation) for observation in observations]
     stacked = {name: np.stack([each[name] for each in parts]) for name in parts[0]}
     tensors: Any = {name: torch.from_numpy(array) for name, array in stacked.items()}

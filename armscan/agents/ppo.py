@@ -41,7 +41,7 @@ class PPO(PolicyParameters):
     """Clipping range: largest change of an action's probability, as a ratio, that is still rewarded."""
 
     ent_coef: float = number(0.003, at_least=0.0, at_most=1000.0)
-    """Weight of the policy's entropy; increase it if the policy settles too early."""
+    """Weight of the policy's entropy; increase it if the policy converges too early."""
 
     vf_coef: float = number(0.5, at_least=0.0, at_most=1000.0)
     """Weight of the critic's loss."""
@@ -62,7 +62,7 @@ class PPO(PolicyParameters):
     """Number of environment steps between two rounds of updates, rounded up to the same number for each environment."""
 
     n_epochs: int = 8
-    """Number of passes of each round of updates over the collected transitions."""
+    """Number of passes over the collected transitions in each round of updates."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -23,11 +23,11 @@ VectorEnvFactory = Callable[[int], VectorEnv[Any, Any, Any]]
 class Agent(Protocol):
     """Chooses planes, one episode after another.
 
-    Episodes that are played side by side are each played by a shallow copy, unless it is a `BatchAgent` too.
+    Of episodes side by side, each is played by a shallow copy of the agent, unless it is a `BatchAgent` too.
     """
 
     def begin(self, *, seed: int, bounds: ActionBounds) -> None:
-        """Begin an episode; all that belongs to it is assigned anew, so that copies do not share it.
+        """Begin an episode; assign all of its state anew, so that copies do not share it.
 
         Args:
             seed: Seed of the agent's random numbers in this episode.
@@ -35,21 +35,21 @@ class Agent(Protocol):
         """
 
     def act(self, observation: Observed, reward: float) -> NDArray[Any]:
-        """Return the next action, shape (n_action,), within [-1, 1], as it is judged: without exploration.
+        """Return the next action, as in evaluations, shape (n_action,), within [-1, 1].
 
         Args:
             observation: Observation of the current plane.
-            reward: Reward of the current plane, which is the start before the first action.
+            reward: Reward of the current plane; before the first action, of the start.
         """
 
 
 @runtime_checkable
 class Learner(Agent, Protocol):
-    """An agent that learns, a stretch of environment steps at a time."""
+    """An agent that learns, one epoch of environment steps at a time."""
 
     @property
     def n_env_steps(self) -> int:
-        """Environment steps taken so far, all of them counted."""
+        """Environment steps taken so far, the warm-up included."""
 
     @property
     def env_steps_at_once(self) -> int:
@@ -86,7 +86,7 @@ class Learner(Agent, Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class AgentSetup:
-    """Everything an agent is made from beside its own parameters.
+    """Everything that an agent is made from except its own parameters.
 
     Args:
         make_envs: Factory of training environments, called with their number; without autoreset.

@@ -1,4 +1,4 @@
-"""A supervised agent: the optimal plane, fitted to random slices whose optimal planes are known."""
+"""Supervised agent that predicts the labelled plane from one observation: its configuration."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Regression(Parameters):
-    """A network that says from one observation where the optimal plane lies, fitted by squared error.
+    """A network that predicts the labelled plane from one observation, fitted by squared error.
 
-    It is supervised with the labelled planes of the training volumes, as the plane finder is: what it reaches says how
-    much of the task needs no search. The network is that of an actor, of the same size; only the mean
-    of its actions is used. With `own_planes_share` it learns from the planes that it would come to, as in DAgger (Ross
-    et al. 2011, arXiv:1011.0686).
+    Like the plane finder, it is trained with the labelled planes of the training volumes; its results show how much of
+    the task needs no search. The network is an actor's, of the same size, of which only the mean of the actions is
+    used. With `own_planes_share` it also learns from planes near its own choices, as in DAgger (Ross et al. 2011,
+    arXiv:1011.0686).
 
     Raises:
         InvalidValueError: If a value is impossible.
@@ -38,7 +38,7 @@ class Regression(Parameters):
 
     own_planes_share: float = number(0.0, at_least=0.0, at_most=1.0)
     """Share of the training planes that lie near the network's own choices, in [0, 1]; the others are random. Slices
-    near the wanted plane, which require precision, are rare among random ones.
+    near the labelled plane, which require precision, are rare among random ones.
     """
 
     def __post_init__(self) -> None:

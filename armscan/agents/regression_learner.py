@@ -1,4 +1,4 @@
-"""The learner of the supervised agent: fits a network to the optimal planes of random slices."""
+"""The learner of the supervised agent: fits a network to the labelled planes of observed slices."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ from armscan.envs.rules import Observed
 from armscan.envs.vector_env import reset_each
 from armscan.utils.arrays import FloatArray
 
-# Of normalised actions: 10 ** -2.5 is half a millimetre along an arm of 300 mm, or a third of a degree.
+# Logarithms of the spread of normalised actions: 10 ** -2.5 is half a millimetre along an arm of 300 mm, or a third of
+# a degree.
 LOG_SPREADS = (-2.5, -0.5)
 
 
@@ -91,7 +92,7 @@ class RegressionLearner(SupervisedLearner):
         return observations
 
     def _next_planes(self, observations: Observed, rng: np.random.Generator) -> FloatArray:
-        """Draw random planes, or such near its own choice, at distances of every order; shape (n, n_action)."""
+        """Draw planes at random, or near the network's choices with log-uniform spreads; shape (n, n_action)."""
         planes = rng.uniform(-1.0, 1.0, self._envs.action_space.shape or ())
         if not self._own_planes_share:
             return planes
@@ -120,14 +121,14 @@ class RegressionLearner(SupervisedLearner):
         """Begin an episode, in which nothing is drawn."""
 
     def act(self, observation: Observed, reward: float) -> NDArray[np.float32]:
-        """Return the optimal action as predicted from this observation alone, shape (n_action,)."""
+        """Return the optimal action predicted from this observation alone, shape (n_action,)."""
         return self._inference.action(observation)
 
     def begin_all(self, *, seeds: Sequence[int], bounds: Sequence[ActionBounds]) -> None:
         """Begin episodes, in which nothing is drawn."""
 
     def act_all(self, observations: Observed, rewards: FloatArray, episodes: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Return the optimal action as predicted from each observation alone, shape (n, n_action)."""
+        """Return the optimal action predicted from each observation alone, shape (n, n_action)."""
         return self._inference.actions(observations, episodes)
 
     def state(self) -> dict[str, Any]:

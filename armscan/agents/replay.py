@@ -1,4 +1,4 @@
-"""The replay buffer: Tianshou's, seeded, cut off at the end of an epoch, and kept in a checkpoint."""
+"""Tianshou's replay buffer, seeded, with episodes cut off at the end of an epoch, and a state for checkpoints."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from tianshou.algorithm.algorithm_base import _gae, _nstep_return
 from tianshou.data import Batch, VectorReplayBuffer
 from tianshou.data.buffer.manager import _next_index, _prev_index
 
-# Kept on disk, or else each process would compile them anew, for five seconds.
+# Cached on disk; otherwise each process would compile them for five seconds.
 for _compiled in (_gae, _nstep_return, _next_index, _prev_index):
     _compiled.enable_caching()
 
 Tree = dict[str, Any]
-"""Tensors by name, and such dicts."""
+"""Nested dicts of tensors."""
 Added = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
 
 
 class Replay(VectorReplayBuffer):
-    """At most `total_size` transitions of `buffer_num` environments, each environment's in a ring of its own."""
+    """At most `total_size` transitions of `buffer_num` environments, with a ring buffer for each environment."""
 
     def hasnull(self) -> bool:
-        """Return False: nothing is NaN.
+        """Return False without searching for NaN.
 
-        Tianshou's collectors ask at every collection, and searching all that is kept costs more the fuller it is.
+        Tianshou's collectors call this at every collection, and a search takes longer the fuller the buffer is.
         Weights that have diverged are found after each epoch.
         """
         return False
@@ -39,8 +39,8 @@ class Replay(VectorReplayBuffer):
             buffer_ids: Environments of the transitions, shape (n,). Default: None, all environments.
 
         Returns:
-            Places of the transitions; returns and lengths of episodes that end with them, 0 for others; and where the
-            episodes begin.
+            Indices of the transitions; returns and lengths of the episodes that end with them, 0 for others; and first
+            indices of the episodes.
         """
         if not self._meta.get_keys():
             first: Added = super().add(Batch(batch), buffer_ids)
@@ -62,9 +62,9 @@ class Replay(VectorReplayBuffer):
             ring._random_state.seed(child.generate_state(1))
 
     def sample_indices(self, batch_size: int | None) -> NDArray[np.int64]:
-        """Return indices of transitions, each as likely as any other; all in order where `batch_size` is 0.
+        """Return indices of transitions, drawn uniformly with replacement; all in order if `batch_size` is 0.
 
-        Tianshou asks every ring for its share of them, at the cost of a fifth of a compiled update.
+        Tianshou samples each ring separately, which costs a fifth of a compiled update.
         """
         if not batch_size:
             in_order: NDArray[np.int64] = super().sample_indices(batch_size)
@@ -100,10 +100,10 @@ class Replay(VectorReplayBuffer):
 
 
 def _write(kept: Any, parts: Any, places: NDArray[np.int64]) -> None:
-    """Write parts of transitions to their places."""
+    """Write parts of transitions to their indices."""
     for name, part in parts.items():
         if isinstance(part, Batch | dict):
-            # Empty parts are in no checkpoint.
+            # `kept` may lack empty parts: a checkpoint leaves them out.
             _write(kept.get(name), part, places)
         else:
             kept[name][places] = part

@@ -25,11 +25,11 @@ class ResidualVectorEnv(VectorWrapper):
 
     Args:
         envs: Environments of the plane finder.
-        finder: Plane finder; it is asked, and does not change.
+        finder: Plane finder, which does not change.
         limits: Largest corrections in the frame of a look, shape (4,): sines of two tilts, mm along the normal and
             across.
-        draw_volumes: Function of a NumPy generator and the number of environments that returns the options of a reset
-            which choose the volume of each episode, or None.
+        draw_volumes: Function of a NumPy generator and the number of environments that returns reset options with the
+            volume of each episode, or None.
     """
 
     def __init__(

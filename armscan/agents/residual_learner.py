@@ -1,4 +1,4 @@
-"""The learner of a taught plane finder whose planes SAC corrects."""
+"""The learner of a pretrained plane finder whose planes SAC corrects."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class ResidualModule(nn.Module):
 
     Args:
         finder: Plane finder.
-        actor: Actor, from features of the plane finder to mean and spread of corrections, shape (n, 4).
+        actor: Actor that maps features of the plane finder to mean and spread of corrections, shape (n, 4).
         limits: Largest corrections in the frame of a look, shape (4,): sines of two tilts, mm along the normal and
             across.
     """
@@ -37,7 +37,7 @@ class ResidualModule(nn.Module):
         super().__init__()
         self.finder, self.actor = finder, actor
         self.register_buffer("limits", limits, persistent=False)
-        # 1 from the first update of SAC on; until then the answers are exactly those of the plane finder.
+        # 1 once SAC learns; until then, the planes are exactly the plane finder's.
         self.register_buffer("is_corrected", torch.zeros_like(limits[0]))
 
     @property
@@ -47,11 +47,11 @@ class ResidualModule(nn.Module):
 
     @property
     def calibration(self) -> Tensor:
-        """Factors of the expected errors, in mm and degrees."""
+        """Calibration factors of the expected errors in mm and in degrees, shape (2,)."""
         return self.finder.calibration
 
     def estimate(self, observations: dict[str, Tensor]) -> Estimate:
-        """Return the plane finder's estimate of the latest look."""
+        """Return the plane finder's estimate at the latest look."""
         return self.finder.estimate(observations)
 
     def forward(self, observations: dict[str, Tensor]) -> tuple[tuple[Tensor, Tensor], None]:
@@ -63,18 +63,18 @@ class ResidualModule(nn.Module):
 
 
 class ResidualLearner(PlaneFinderLearner):
-    """Teaches a plane finder, then lets SAC learn to correct its planes.
+    """Pretrains a plane finder, then lets SAC learn to correct its planes.
 
     Args:
         parameters: Parameters of the plane finder.
         setup: Environments, spaces, budget and seed of the agent.
         sac: Hyperparameters of SAC.
-        pretraining_env_steps: Number of environment steps of the teaching; the rest of the budget is for SAC.
+        pretraining_env_steps: Number of environment steps of the pretraining; SAC gets the rest of the budget.
         correction_mm: Largest correction along the normal of the plane, and across, in mm.
         correction_deg: Largest correction of each of the two tilts of the plane, in degrees.
 
     Raises:
-        InvalidValueError: If the environment steps after the teaching are too few for SAC.
+        InvalidValueError: If the environment steps after the pretraining are too few for SAC.
     """
 
     def __init__(
@@ -111,12 +111,12 @@ class ResidualLearner(PlaneFinderLearner):
 
     @property
     def n_env_steps(self) -> int:
-        """Environment steps taken so far, those of the teaching included."""
+        """Environment steps taken so far, in pretraining and by SAC."""
         return super().n_env_steps + self._sac.n_env_steps
 
     @property
     def env_steps_at_once(self) -> int:
-        """The more of those that teaching and SAC take."""
+        """The larger of the plane finder's and SAC's."""
         return max(super().env_steps_at_once, self._sac.env_steps_at_once)
 
     @property
@@ -125,7 +125,7 @@ class ResidualLearner(PlaneFinderLearner):
         return f"{self._sac.update_note}, after the teaching"
 
     def learn(self, n_env_steps: int) -> dict[str, float]:
-        """Learn for an epoch, which ends with the teaching if it is of that; see `Learner.learn`."""
+        """Learn for one epoch, cut short at the end of the pretraining; see `Learner.learn`."""
         if (n_left := self._pretraining_env_steps - super().n_env_steps) > 0:
             return super().learn(min(n_env_steps, n_left))
         if not self._corrected.is_corrected:
@@ -135,7 +135,7 @@ class ResidualLearner(PlaneFinderLearner):
         return self._sac.learn(n_env_steps)
 
     def state(self) -> dict[str, Any]:
-        """Return the states of the teaching and of SAC."""
+        """Return the states of the plane finder and of SAC."""
         return {**super().state(), "sac": self._sac.state()}
 
     def load_state(self, state: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""A taught plane finder whose planes SAC corrects: its configuration."""
+"""A pretrained plane finder whose planes SAC corrects: its configuration."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class ResidualSAC(PlaneFinder):
-    """A plane finder that is taught first; SAC then fine-tunes its planes on the reward, while its network is kept.
+    """A plane finder that is pretrained; SAC then corrects its planes to increase the reward, with the network frozen.
 
-    Residual policy learning (Silver et al. 2018, arXiv:1812.06298): the action of SAC is a correction of the plane that
-    the taught network finds, and SAC observes what that network has computed from the looks. At the beginning of the
-    fine-tuning, the policy is the taught one. The keys of the plane finder stand beside these.
+    Residual policy learning (Silver et al. 2018, arXiv:1812.06298): SAC's action is a correction of the plane that the
+    pretrained network finds, and SAC observes the features that this network has computed from the looks. Until SAC
+    learns, the policy is the plane finder's. The keys of the plane finder stand beside these.
 
     Raises:
         InvalidValueError: If a value is impossible.
     """
 
     sac: SAC
-    """Hyperparameters of SAC; its environment steps with random actions are random corrections."""
+    """Hyperparameters of SAC; `learning_starts` counts environment steps with random corrections."""
 
     pretraining_env_steps: int
-    """Number of environment steps of the teaching; the rest of `training.env_steps` is for SAC."""
+    """Number of environment steps of the pretraining; SAC gets the rest of `training.env_steps`."""
 
     correction_mm: float = number(2.0, above=0.0, at_most=50.0)
     """Largest correction along the normal of the plane, and across, in mm."""
@@ -51,7 +51,7 @@ class ResidualSAC(PlaneFinder):
         """Make an agent that has learned nothing yet.
 
         Raises:
-            InvalidValueError: If the environment does not show or allow what it needs, or the training is too short.
+            InvalidValueError: If the observations or actions do not fit, or the training is too short.
         """
         if self.pretraining_env_steps >= setup.total_env_steps:
             raise InvalidValueError(

@@ -40,7 +40,7 @@ class SAC(PolicyParameters):
     """See `Parameters.SCHEDULABLE`."""
 
     ent_coef_init: float = number(0.1, above=0.0, at_most=1000.0)
-    """Initial entropy coefficient; rewards here are small, so 1 would dominate them for long."""
+    """Initial entropy coefficient; rewards here are small, so 1 would dominate them for a long time."""
 
     ent_coef_lr: float = number(3e-4, above=0.0, at_most=1.0)
     """Learning rate of the entropy coefficient."""
@@ -67,7 +67,7 @@ class SAC(PolicyParameters):
     """Number of environment steps between two rounds of updates, rounded up to the same number for each environment."""
 
     utd_ratio: float = number(0.25, above=0.0, at_most=1000.0)
-    """Mean number of gradient steps for each environment step; they are most of the training's cost."""
+    """Mean number of gradient steps for each environment step; they dominate the training's cost."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

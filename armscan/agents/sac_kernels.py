@@ -1,6 +1,6 @@
 """A gradient step of SAC for fully connected networks with ReLU, compiled.
 
-A critic's network has one head, an actor's two: mean and logarithm of the spread.
+A critic has one head, an actor two: mean and log standard deviation.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from armscan.agents.mlp_kernels import (
 )
 from armscan.utils.arrays import FloatArray
 
-# As Tianshou has them: bounds of the logarithm of the spread, and what keeps the logarithm of 1 - tanh(x)^2 finite.
+# Tianshou's bounds of the log standard deviation, and its constant that keeps log(1 - tanh(x)^2) finite.
 LOG_STD_MIN, LOG_STD_MAX, EPS = F(-20.0), F(2.0), np.finfo(np.float32).eps
 LOG_SQRT_2PI = F(0.5 * math.log(2.0 * math.pi))
 
 
 class Transitions(NamedTuple):
-    """All transitions of a replay buffer, the first axis of each part."""
+    """All transitions of a replay buffer, along the first axis of each array."""
 
     obs: Floats
     obs_next: Floats
@@ -45,7 +45,7 @@ class Transitions(NamedTuple):
 
 
 class Drawn(NamedTuple):
-    """Actions that were drawn, shape (n, n_action) each, but for the logarithms of their probabilities, shape (n,)."""
+    """Sampled actions with their (log) standard deviations, shape (n, n_action), and log-probabilities, shape (n,)."""
 
     log_std: Floats
     std: Floats
@@ -62,7 +62,7 @@ class Entropy(NamedTuple):
 
 
 class Agent(NamedTuple):
-    """Networks and settings of SAC; the targets are the critics' lagging copies."""
+    """Networks and settings of SAC; `targets` are the target critics."""
 
     actor: Weights
     critics: tuple[Weights, Weights]
@@ -75,7 +75,7 @@ class Agent(NamedTuple):
 
 @fast_njit
 def _act(actor: Weights, layers: Layers, noise: Floats) -> Drawn:
-    """Draw an action for each observation that the first of the actor's layers holds."""
+    """Sample an action for each observation in the actor's input layer."""
     n, n_action = noise.shape
     log_std, std, actions = np.empty((n, n_action), F), np.empty((n, n_action), F), np.empty((n, n_action), F)
     log_prob = np.zeros(n, F)
@@ -95,7 +95,7 @@ def _act(actor: Weights, layers: Layers, noise: Floats) -> Drawn:
 
 @fast_njit
 def _fill_input(layers: Layers, obs: Floats, actions: Floats) -> None:
-    """Fill the first of the critics' layers."""
+    """Fill the critics' input layer."""
     n, n_obs = obs.shape
     x = layer_view(layers.values, layers.sizes, n, 0)
     for i in range(n):
@@ -107,7 +107,7 @@ def _fill_input(layers: Layers, obs: Floats, actions: Floats) -> None:
 
 @fast_njit
 def _q_values(critic: Floats, layers: Layers, values: Floats) -> int:
-    """Fill a critic's values, shape (n, 1); returns where the weights of its head start."""
+    """Compute a critic's values, shape (n, 1); return where the weights of its head start."""
     n: int = values.shape[0]
     head: int = forward(critic, layers, n)
     linear(layer_view(layers.values, layers.sizes, n, layers.sizes.size - 1), critic, head, values, False)
@@ -116,7 +116,7 @@ def _q_values(critic: Floats, layers: Layers, values: Floats) -> int:
 
 @fast_njit
 def _critic_gradient(critic: Weights, layers: Layers, head: int, d_values: Floats, of_input: bool) -> None:
-    """Fill the gradient of a critic's input, or else of its weights, from that of its values."""
+    """Backpropagate the gradient of a critic's values to its input, or else to its weights."""
     n, last = d_values.shape[0], layers.sizes.size - 1
     if not of_input:
         linear_gradient(layer_view(layers.values, layers.sizes, n, last), d_values, critic.gradient, head)
@@ -126,7 +126,7 @@ def _critic_gradient(critic: Weights, layers: Layers, head: int, d_values: Float
 
 @fast_njit
 def _update_critic(critic: Weights, layers: Layers, adam: Adam, td_targets: Floats) -> float:
-    """Take a gradient step of a critic; returns its loss."""
+    """Take a gradient step of a critic; return its loss."""
     n = td_targets.size
     values, d_values = np.empty((n, 1), F), np.empty((n, 1), F)
     head = _q_values(critic.values, layers, values)
@@ -144,7 +144,7 @@ def _update_critic(critic: Weights, layers: Layers, adam: Adam, td_targets: Floa
 def _update_actor(
     agent: Agent, layers: Layers, critic_layers: Layers, noise: Floats, alpha: np.float32
 ) -> tuple[float, float]:
-    """Take a gradient step of the actor; returns its loss, and the mean logarithmic probability of its actions."""
+    """Take a gradient step of the actor; return its loss, and the mean log-probability of its actions."""
     n, n_action = noise.shape
     obs = layer_view(layers.values, layers.sizes, n, 0)
     drawn = _act(agent.actor, layers, noise)
@@ -164,7 +164,7 @@ def _update_actor(
         value1, value2 = values[0, i, 0], values[1, i, 0]
         loss += alpha * drawn.log_prob[i] - min(value1, value2)
         mean_log_prob += drawn.log_prob[i]
-        # Only the smaller value counts; torch halves the gradient between equal ones.
+        # Only the smaller value has a gradient; torch halves it between equal ones.
         share = F(1.0) if value1 < value2 else F(0.5) if value1 == value2 else F(0.0)
         for j in range(n_action):
             action, log_s = drawn.actions[i, j], drawn.log_std[i, j]
@@ -180,7 +180,7 @@ def _update_actor(
 
 @fast_njit
 def _actor_gradient(actor: Weights, layers: Layers, d_mean: Floats, d_log_std: Floats) -> None:
-    """Fill the gradient of an actor's weights from that of its two heads."""
+    """Backpropagate the gradients of an actor's two heads to its weights."""
     n, n_action, last = d_mean.shape[0], d_mean.shape[1], layers.sizes.size - 1
     features = layer_view(layers.values, layers.sizes, n, last)
     d_features, of_std = layer_view(layers.gradient, layers.sizes, n, last), np.empty_like(features)
@@ -198,7 +198,7 @@ def _actor_gradient(actor: Weights, layers: Layers, d_mean: Floats, d_log_std: F
 
 @fast_njit
 def _update_coefficient(entropy: Entropy, mean_log_prob: float) -> float:
-    """Take a gradient step of the entropy coefficient; returns its loss."""
+    """Take a gradient step of the entropy coefficient; return its loss."""
     deficit = entropy.target + mean_log_prob
     loss: float = -entropy.log_alpha.values[0] * deficit
     entropy.log_alpha.gradient[0] = -deficit
@@ -216,7 +216,7 @@ def _td_targets(
     layers: Layers,
     alpha: np.float32,
 ) -> Floats:
-    """Return the critics' targets for a batch, from the actions drawn after it."""
+    """Return the critics' TD targets for a batch, from the actions sampled at its next observations."""
     values, td_targets = np.empty((2, index.size, 1), F), np.empty(index.size, F)
     _fill_input(layers, obs_next, drawn.actions)
     for k in range(2):
@@ -230,7 +230,7 @@ def _td_targets(
 
 @fast_njit
 def _take(rows: Floats, index: Ints, out: Floats) -> None:
-    """Fill a batch with its rows."""
+    """Copy the rows of a batch to `out`."""
     for i in range(index.size):
         for j in range(out.shape[1]):
             out[i, j] = rows[index[i], j]
@@ -246,12 +246,13 @@ def update(
     critic_layers: Layers,
     losses: FloatArray,
 ) -> None:
-    """Take k gradient steps, each of the critics, then of the actor and the entropy coefficient; move the targets.
+    """Take k gradient steps, each of the critics, the actor and the entropy coefficient; update the targets each time.
 
     Args:
         transitions: All transitions of the replay buffer.
         indices: Indices of the transitions of each batch, shape (k, n).
-        noise: Standard normal noise for the actions after the transitions and before, shape (k, 2, n, n_action).
+        noise: Standard normal noise for the actions at the next and at the current observations, shape (k, 2, n,
+            n_action).
         agent: Networks and settings.
         actor_layers: Memory for the actor's layers.
         critic_layers: Memory for a critic's layers.

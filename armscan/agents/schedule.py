@@ -16,11 +16,11 @@ FROM, AGENT = "from_env_steps", "agent."
 
 @dataclass(frozen=True)
 class Segment:
-    """A part of a training with other hyperparameters than before.
+    """A part of a training with changed hyperparameters.
 
     Args:
-        from_env_steps: Start: it applies from the first epoch that begins after at least so many environment steps.
-        values: Values that change, by the names of the algorithm's fields.
+        from_env_steps: Start: it applies from the first epoch that begins at or after this environment step.
+        values: Changed values, by the names of the algorithm's fields.
     """
 
     from_env_steps: int
@@ -31,7 +31,7 @@ def read_schedule(where: str, described: Any, total_env_steps: int) -> tuple[Seg
     """Return the segments of a schedule.
 
     Args:
-        where: Place of the schedule in the configuration, for messages.
+        where: Configuration key of the schedule, for messages.
         described: Mappings such as `{from_env_steps: 4000, agent.lr: 0.001}`, in order; None for no change.
         total_env_steps: Budget of the training, in environment steps; each segment begins before it.
 

@@ -16,19 +16,19 @@ from armscan.utils.arrays import FloatArray
 if TYPE_CHECKING:
     from armscan.agents.policy import Policy
 
-# Attributes that evaluations and runs ask a learner for, and that it may lack.
+# Optional attributes of a learner that evaluations and runs read.
 OPTIONAL = ("validation_note", "warm_up_note", "expected_error", "expected_errors")
 
 
 class ScheduledLearner:
-    """A learner that another one replaces at a given environment step.
+    """A sequence of learners, each of which replaces the one before it at a given environment step.
 
-    At the first epoch that begins at or after that step, the next learner loads the state of the one before. Which
-    one learns follows from the environment steps alone, so that a training that is resumed at any epoch, or that goes
-    on from another's checkpoint, is the same bit for bit as one that was never interrupted.
+    At the first epoch that begins at or after that step, the next learner loads the state of the one before. Which one
+    learns depends on the environment steps alone, so a training that is resumed at any epoch, or continued from
+    another's checkpoint, equals bit for bit one that was never interrupted.
 
     Args:
-        first: Learner from the beginning on.
+        first: Learner of the beginning.
         later: First environment step and learner of each segment, in order; each has learned nothing yet.
     """
 
@@ -55,7 +55,7 @@ class ScheduledLearner:
         return self._learner.update_note
 
     def __getattr__(self, name: str) -> Any:
-        """Return what only some learners have: a note, or the errors that they expect."""
+        """Return an optional attribute of the current learner."""
         if name in OPTIONAL:
             return getattr(self._learner, name)
         raise AttributeError(f"{type(self).__name__!r} has no attribute {name!r}")
@@ -65,7 +65,7 @@ class ScheduledLearner:
         self._learner.warm_up()
 
     def learn(self, n_env_steps: int) -> dict[str, float]:
-        """Learn with the hyperparameters of this moment; see `Learner.learn`."""
+        """Learn with the hyperparameters of the current segment; see `Learner.learn`."""
         due = None
         while self._later and self._later[0][0] <= self.n_env_steps:
             due = self._later.pop(0)[1]

@@ -25,10 +25,10 @@ Actions = NDArray[np.float32]
 
 
 class StepCollector(Collector[CollectStats]):
-    """Tianshou's collector; steps of Gaussian policies are collected as arrays, by its rules and to the bit as it does.
+    """Tianshou's collector, which collects steps of Gaussian policies as arrays, with the same result to the bit.
 
-    Its own goes through some 7,000 Python calls for a step of all environments, most of them for a `Batch` that is made
-    only to be copied into the replay buffer. `_is_plain` holds the whole rule of when they are spared.
+    Tianshou makes some 7,000 Python calls for a step of all environments, most of them for a `Batch` that is made only
+    to be copied into the replay buffer. `_is_plain` holds the full condition for collecting arrays.
 
     Args:
         policy: Policy that chooses the actions.
@@ -65,7 +65,7 @@ class StepCollector(Collector[CollectStats]):
         self._validate_n_step_n_episode(n_episode, n_step)
         start_s = time.perf_counter()
         if self.policy.training:
-            # Tianshou would go back to it after every collection; its updates see to that themselves.
+            # Tianshou would restore training mode after every collection; its updates set it themselves.
             self.policy.eval()
         stats = self._collect_steps(n_step, random)
         stats.set_collect_time(time.perf_counter() - start_s)
@@ -107,7 +107,7 @@ class StepCollector(Collector[CollectStats]):
         policy: Any = self.policy
         is_sac = type(policy) is SACPolicy
         means_and_spreads = self._means_and_spreads(observations)
-        # Checks that they are numbers, as the distributions of Tianshou do.
+        # Raises an error for NaN, as Tianshou's distributions do.
         chosen_from: Distribution = (
             Independent(Normal(*means_and_spreads), 1) if is_sac else policy.dist_fn(means_and_spreads)
         )
@@ -118,7 +118,7 @@ class StepCollector(Collector[CollectStats]):
         return (torch.tanh(actions) if is_sac else actions).cpu().numpy(), chosen_from.stddev.cpu().numpy()
 
     def _means_and_spreads(self, observations: Observed) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the means and spreads of the actor, bit for bit; without its modules in a third of the time."""
+        """Return the actor's means and spreads, bit for bit; bypassing its modules takes a third of the time."""
         if self._layers is None:
             policy: Any = self.policy
             means_and_spreads: tuple[torch.Tensor, torch.Tensor] = policy.actor(observations)[0]
@@ -130,12 +130,12 @@ class StepCollector(Collector[CollectStats]):
         return linear(features, *mean), linear(features, *spread).clamp(SIGMA_MIN, SIGMA_MAX).exp()
 
     def _step(self, observations: Observed, actions: Actions, sent: Actions) -> tuple[Observed, NDArray[Any]]:
-        """Take a step in all environments and keep the transitions.
+        """Take a step in all environments and store the transitions.
 
         Args:
             observations: Observations of the current planes.
             actions: Actions of the policy, which are stored, shape (n_envs, n_action).
-            sent: The same actions in the form that the environments take.
+            sent: The same actions as the environments take them.
 
         Returns:
             The next observations, those of new episodes included; and the returns and lengths of the episodes that have
@@ -156,9 +156,9 @@ class StepCollector(Collector[CollectStats]):
             }
         )
         if done.any():
-            # Of all environments, those that are left as they are included.
+            # Observations of all environments, also of those that are not reset.
             observations_next = self._envs.begin(done)
-        # As Tianshou counts: those of its transitions that the buffer holds.
+        # Lengths as Tianshou counts them: the transitions that are still in the buffer.
         kept = [
             self._replay.get_buffer_indices(*each).size for each in zip(starts[done], places[done] + 1, strict=True)
         ]

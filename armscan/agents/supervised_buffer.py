@@ -15,12 +15,12 @@ from armscan.utils.arrays import FloatArray
 
 
 class SupervisedBuffer:
-    """Observations with the optimal actions of their episodes; the oldest make way for new ones.
+    """Observations with the optimal actions of their episodes; new ones overwrite the oldest.
 
     Args:
         size: Maximum number of observations.
         space: Space of one observation.
-        n_action: Components of an action.
+        n_action: Number of components of an action.
     """
 
     def __init__(self, size: int, space: spaces.Space[Any], n_action: int) -> None:

@@ -1,4 +1,4 @@
-"""The vector environment as Tianshou's collectors take it."""
+"""Adapter from the vector environment to Tianshou's interface."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ Ids = int | list[int] | NDArray[np.int64] | None
 
 
 class TianshouVectorEnv(BaseVectorEnv):
-    """A Gymnasium vector environment without autoreset, under the interface of Tianshou's own ones.
+    """A Gymnasium vector environment without autoreset, under the interface of Tianshou's vector environments.
 
     `info` is left out, because a replay buffer would store it with every transition.
 
     Args:
-        envs: Steps all environments at once.
+        envs: Vector environment to adapt.
 
     Attributes:
         n_ended: Number of episodes that have ended since it was set to 0.
@@ -38,20 +38,20 @@ class TianshouVectorEnv(BaseVectorEnv):
         self.is_closed = False
         self._envs = envs
         if isinstance(bare := envs.unwrapped, ArmscanVectorEnv):
-            # The wrappers require more than is read here.
+            # `is_success` is read here; the wrappers require the others.
             bare.info_keys = ("is_success",) if bare is envs else ("action", "reward", "is_success")
         self._seeds: list[int | None] | None = None
         self.n_ended = self.n_successes = 0
         self._action_spaces = [deepcopy(envs.single_action_space) for _ in range(envs.num_envs)]
 
     def get_env_attr(self, key: str, id: Ids = None) -> list[Any]:  # noqa: A002 - Tianshou's name
-        """Return the spaces of each environment."""
+        """Return an attribute of each environment, such as its action space."""
         if key == "action_space":
             return list(self._action_spaces)
         return [getattr(self._envs, f"single_{key}", getattr(self._envs, key, None))] * self.env_num
 
     def reset(self, env_id: Ids = None, **kwargs: Any) -> tuple[Any, NDArray[Any]]:
-        """Start episodes; return the first observations of those environments, and no information."""
+        """Start episodes; return the first observations of these environments, and infos with only their IDs."""
         ids = np.arange(self.env_num) if env_id is None else np.atleast_1d(env_id)
         observations = self.begin(np.isin(np.arange(self.env_num), ids))
         return batched(observations)[ids], self._no_info(ids)
@@ -63,7 +63,7 @@ class TianshouVectorEnv(BaseVectorEnv):
         return batched(observations), *outcome, self._no_info(np.arange(self.env_num))
 
     def begin(self, mask: Mask) -> Observed:
-        """Start episodes in the environments of a mask; return the observations of all of them."""
+        """Start episodes in the environments of a mask; return the observations of all environments."""
         observations, _ = reset_each(self._envs, self._seeds, {"reset_mask": mask})
         self._seeds = None
         return observations

@@ -1,4 +1,4 @@
-"""Tianshou, imported without packages that armscan does not use through it: half a second less for each process."""
+"""Import Tianshou without the packages that armscan does not need; this saves each process half a second."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ def import_tianshou() -> None:
     """Import Tianshou, with an empty class for each name of `STAND_INS`, and without Ray.
 
     Call it before anything else imports Tianshou; afterwards it does nothing. Tianshou keeps the empty classes, so its
-    logger for TensorBoard and its multi-agent environments do not work in this process. Anybody else who imports the
+    logger for TensorBoard and its multi-agent environments do not work in this process. Other code that imports these
     modules gets the real ones.
     """
-    # None makes an import fail: Tianshou does without Ray then.
+    # None makes the import fail, and Tianshou works without Ray.
     modules: dict[str, Any] = {"ray": None}
     for name, part in STAND_INS.items():
         modules[name] = ModuleType(name)

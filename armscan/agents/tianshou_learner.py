@@ -1,4 +1,4 @@
-"""Tianshou's trainer behind the few methods that training needs of a learner."""
+"""Adapter from Tianshou's trainers to the `Learner` interface."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from armscan.envs.actions import ActionBounds
 from armscan.envs.rules import Observed
 from armscan.utils.arrays import FloatArray
 
-# Tianshou measures how long it takes on the wall clock, and raises an error where that is turned back meanwhile.
+# Tianshou measures durations by the wall clock, and raises an error if it is set back. Replace it by a monotonic clock.
 for _module in (algorithm_base, collector, tianshou.trainer):
     vars(_module)["time"] = SimpleNamespace(time=time.perf_counter, sleep=time.sleep)
 
@@ -41,13 +41,13 @@ class TianshouLearner(BaseLearner):
     Its test collector, persistence and progress bars are left out: evaluation, checkpoints and progress are the same
     for every agent, and belong to training.
 
-    Every epoch begins with new episodes, and draws everything from `seed` and its own number. So nothing of an
-    episode has to be kept for a training to continue later exactly as it would have continued at once.
+    Every epoch begins with new episodes and seeds all random numbers with (`seed`, epoch). So a resumed training equals
+    an uninterrupted one without any state of an episode.
 
     Args:
         trainer: Trainer of Tianshou, with `training_parameters`.
         bounded: Function that maps the mean of the policy's actions to [-1, 1], as the trainer's policy does.
-        parameters: Parameters of the algorithm; learning rates fall in each epoch in proportion to its steps.
+        parameters: Parameters of the algorithm; learning rates are set at the beginning of each epoch.
         setup: Environments, spaces, budget and seed of the agent.
         learning_starts: Number of environment steps with random actions before the first update. Default: 0.
     """
@@ -75,7 +75,7 @@ class TianshouLearner(BaseLearner):
         self._network = policy = self._algorithm.policy
         self._inference = Inference(policy.actor, bounded, setup.compute, is_sampling=not policy.deterministic_eval)
         critics = [module for name, module in self._algorithm.named_children() if name.startswith("critic")]
-        # Lagging copies of the critics included.
+        # The target critics included.
         for network in (policy.actor, *critics):
             setup.compute.apply_to(network)
 
@@ -97,7 +97,7 @@ class TianshouLearner(BaseLearner):
 
     @property
     def update_note(self) -> str:
-        """Return how gradient steps are computed: `compiled`, or `Tianshou` with the reason, if there is one."""
+        """Return how gradient steps are computed: `compiled`, or `Tianshou`, with the reason if there is one."""
         if not isinstance(self._algorithm, CompiledSAC):
             return "Tianshou"
         reason = self._algorithm.fallback_reason
@@ -110,7 +110,7 @@ class TianshouLearner(BaseLearner):
 
     @property
     def warm_up_note(self) -> str | None:
-        """Return how many random steps come before the first update, as a string; None if there are none."""
+        """Return a note on the number of random steps before the first update; None if there are none."""
         return f"{self._learning_starts:,} before the first update" if self._learning_starts else None
 
     def warm_up(self) -> None:
@@ -132,7 +132,7 @@ class TianshouLearner(BaseLearner):
         try:
             self._trainer.execute_epoch()
         except ValueError as error:
-            # torch's distributions refuse the NaNs of a policy that has diverged.
+            # torch's distributions refuse NaN, which a diverged policy returns.
             self._check_weights(error)
             raise
         self._check_weights()
@@ -166,7 +166,7 @@ class TianshouLearner(BaseLearner):
             raise diverged(self.n_env_steps, f"agent.lr{or_entropy}") from cause
 
     def begin(self, *, seed: int, bounds: ActionBounds) -> None:
-        """Begin an episode; only a policy whose evaluation samples actions draws anything in it."""
+        """Begin an episode; random numbers are drawn in it only if evaluations sample actions."""
         self._inference.begin([seed])
 
     def act(self, observation: Observed, reward: float) -> NDArray[np.float32]:
@@ -182,7 +182,7 @@ class TianshouLearner(BaseLearner):
         return self._inference.actions(observations, episodes)
 
     def policy(self) -> Policy:
-        """Return a copy of the actor that `act` uses; it returns the mode of its actions."""
+        """Return a copy of the actor that `act` uses; it returns the mode of the actions."""
         policy = self._algorithm.policy
         return Policy(policy.actor, self._bounded, self._compute, is_sampling=not policy.deterministic_eval)
 
@@ -201,11 +201,11 @@ class TianshouLearner(BaseLearner):
         """Restore what `state` returned.
 
         Raises:
-            CheckpointError: If it is that of another agent.
+            CheckpointError: If the state belongs to another agent.
         """
         load_into(self._algorithm, dict(state["algorithm"]))
         if optimiser := _entropy_optimiser(self._algorithm):
-            # Its learning rate is the configuration's, which a schedule may have changed.
+            # Keep the configured learning rate, which a schedule may have changed.
             lr = optimiser.param_groups[0]["lr"]
             optimiser.load_state_dict(state["entropy_optimiser"])
             optimiser.param_groups[0]["lr"] = lr

@@ -1,4 +1,4 @@
-"""A policy as files that do not require armscan: a torch program, and ONNX."""
+"""Export of a policy to files that do not require armscan: a torch program, and ONNX."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from armscan.errors import ExportError, is_interruption
 if TYPE_CHECKING:
     from torch.export import ExportedProgram
 
-# Of an observation that is one vector, and of what comes out; a part of an observation may be called `action`.
+# Names of the input, if the observation is one vector, and of the output; an input may already be called `action`.
 OBSERVATION, NEXT_ACTION = "observation", "next_action"
 MAX_REASON_CHARS = 300
 
@@ -72,7 +72,7 @@ def save_onnx(program: ExportedProgram, batch: Batch, file: Path) -> None:
 @contextmanager
 def _quietly(what: str) -> Iterator[None]:
     """Silence the libraries of an export, and turn its errors into one line."""
-    # It looks for torchvision.
+    # torch.onnx reports that torchvision is missing.
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     try:
         with warnings.catch_warnings():

@@ -32,24 +32,24 @@ def disc_half_widths(eps: float, row_step: float = 1.0, col_step: float = 1.0) -
 
 @cached_njit(nogil=True)
 def count_disc_pixels(half_widths: IntArray) -> int:
-    """Return how many pixels a disc has, its middle included."""
+    """Return the number of pixels in a disc, its centre included."""
     return int(2 * np.sum(2 * half_widths + 1) - (2 * half_widths[0] + 1))
 
 
 @cached_njit(nogil=True, error_model="numpy")
 def _find_core(mask: Pixels, stride: int, margin: int, half_widths: IntArray, min_samples: int, zero: Any) -> Pixels:
-    """Return 0 or 1 for each pixel but the margins of a flat mask: whether it is a core pixel.
+    """Return 0 or 1 for each pixel of a flat mask without its margins: whether it is a core pixel.
 
-    The mask's rows of `stride` have at least as many columns of margin as the disc is wide, and as many rows above and
-    below as it is high, so that no disc leaves it. `zero` is of the smallest type that holds the disc's number of
-    pixels: small types are summed many at a time.
+    The mask has rows of length `stride`, with margins of at least the disc's half width in columns and its half height
+    in rows, so that no disc leaves it. `zero` is of the smallest type that holds the disc's number of pixels: SIMD sums
+    more of a small type at a time.
     """
     pad, reach = half_widths[0], half_widths.size - 1
     first = reach * stride + margin
     n_pixels = mask.size - 2 * first
     inside = mask[first : first + n_pixels]
     window = np.full(n_pixels, zero)
-    # By a loop: at an assignment to a slice, Numba compiles the text of its shape error, for two seconds.
+    # A loop, because Numba takes two seconds longer to compile an assignment to a slice: for its shape error's text.
     for i in range(n_pixels):
         window[i] = inside[i]
     counts = np.full(n_pixels + 2 * reach * stride, zero)
@@ -65,7 +65,7 @@ def _find_core(mask: Pixels, stride: int, margin: int, half_widths: IntArray, mi
                     shifted[i] += window[i]
     core = np.zeros(n_pixels, dtype=np.uint8)
     if min_samples <= count_disc_pixels(half_widths):
-        # Of the same type as the counts, or all of them would be widened to compare them.
+        # Of the counts' type, or the comparison would widen all of them.
         fewest, of_pixels = type(zero)(min_samples), counts[reach * stride :]
         for i in range(n_pixels):
             core[i] = inside[i] & np.uint8(of_pixels[i] >= fewest)
@@ -93,8 +93,8 @@ def _reached(shape: tuple[int, int], runs: Runs, numbers: RunArray, half_widths:
 def bounding_boxes(slice_xz: Pixels, labels: IntArray) -> IntArray:
     """Return for each label its first row, row after the last, first column and column after the last, shape (n, 4).
 
-    All four are 0 for a label that the slice does not have. There are at most eight labels, each of which has a bit of
-    the bytes that are joined, many at a time.
+    All four are 0 for a label that the slice lacks. There may be at most eight labels: each has one bit of a byte, so
+    that SIMD combines many pixels at a time.
     """
     n_rows, n_cols = slice_xz.shape
     pixels = slice_xz.ravel()
@@ -119,7 +119,7 @@ def bounding_boxes(slice_xz: Pixels, labels: IntArray) -> IntArray:
 
 @cached_njit(nogil=True, error_model="numpy")
 def _ends(found: Pixels, bit: np.uint8) -> tuple[int, int]:
-    """Return the first place that has the bit, and that after the last; 0 and 0 if none has."""
+    """Return the first index with the bit and the index after the last one; 0 and 0 if there is none."""
     first, stop = 0, found.size
     while first < stop and not found[first] & bit:
         first += 1
@@ -134,14 +134,16 @@ def _ends(found: Pixels, bit: np.uint8) -> tuple[int, int]:
 def _cluster(
     slice_xz: Pixels, label: int, box: IntArray, half_widths: IntArray, min_samples: int
 ) -> tuple[Pixels, RunArray, IntArray]:
-    """Cluster a label's pixels, all in the box; return their mask and clusters in it.
+    """Cluster a label's pixels, all of which lie in the box.
 
-    Last, for each cluster, noise at the end, the number of its pixels and the sums of their rows and columns.
+    Returns:
+        The label's mask and the cluster of each pixel, both over the box; and for each cluster, noise last, the number
+        of its pixels and the sums of their rows and columns, shape (n_clusters + 1, 3).
     """
     row_first, row_stop, col_first, col_stop = box
     n_rows, n_cols = row_stop - row_first, col_stop - col_first
     pad, reach = half_widths[0], half_widths.size - 1
-    # One margin between two rows serves both. Rows and what is before them are whole words, to be passed over as such.
+    # Adjacent rows share a margin. Rows and the margin before them are whole words, so that empty words can be skipped.
     stride, margin = (n_cols + pad + WORD - 1) // WORD * WORD, (pad + WORD - 1) // WORD * WORD
     flat = np.zeros((n_rows + 2 * reach) * stride + 2 * margin, dtype=np.uint8)
     mask = flat[reach * stride + margin :][: n_rows * stride].reshape((n_rows, stride))
@@ -155,7 +157,7 @@ def _cluster(
     else:
         flat_core = _find_core(flat, stride, margin, half_widths, min_samples, np.uint32(0))
     core = flat_core.reshape((n_rows, stride))
-    # Below an eps of one column not even the next pixel is a neighbour, and every run is a single pixel.
+    # With an eps below one column not even adjacent pixels are neighbours, and every run is a single pixel.
     runs = find_runs(core, n_cols, pad >= 1)
     numbers, n_clusters = number_runs(runs, half_widths)
     clusters = _reached((n_rows, n_cols), runs, numbers, half_widths, n_clusters)
@@ -191,7 +193,7 @@ def cluster_label(
         the lowest-numbered cluster within eps; 0 for noise and background), the mean pixel coordinate of each
         cluster, shape (n_clusters, 2), and its number of pixels, shape (n_clusters,).
     """
-    # Of labels of other types than the volumes' bytes there may be any number.
+    # A binary mask: slices that are not of the volumes' type may hold any integer labels.
     is_label = np.ascontiguousarray(slice_xz == label).view(np.uint8)
     (box,) = bounding_boxes(is_label, np.array([1]))
     mask, clusters, sums = _cluster(is_label, 1, box, half_widths, min_samples)

@@ -1,4 +1,4 @@
-"""Connected components of pixels that touch over a distance, compiled: runs of pixels in a union-find forest.
+"""Compiled connected components of pixels that touch over a distance: runs of pixels in a union-find forest.
 
 Two runs in rows d apart touch when the gap between them is at most the disc's half width at d.
 """
@@ -15,16 +15,16 @@ RunArray = NDArray[np.int32]
 # First and last column of each run, and the number of the first run of each row.
 Runs = tuple[RunArray, RunArray, IntArray]
 Pixels = NDArray[np.uint8]
-# Pixels that are looked at together where most are background: the bytes of a 64-bit integer.
+# Pixels that are skipped together if all are background: the bytes of a 64-bit integer.
 WORD = 8
 
 
 @cached_njit(nogil=True, error_model="numpy")
 def find_runs(image: Pixels, n_cols: int, are_joined: bool) -> Runs:
-    """Return the runs of pixels of a binary image; where neighbours in a row are not joined, each pixel is one.
+    """Return the runs of pixels in a binary image; if neighbours in a row are not joined, each pixel is a run.
 
     Args:
-        image: 0 or 1 for each pixel; rows of whole words.
+        image: 0 or 1 for each pixel; the length of a row is a multiple of 8.
         n_cols: Number of columns that may hold a 1.
         are_joined: Whether neighbours in a row touch.
     """

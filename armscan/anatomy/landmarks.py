@@ -70,7 +70,7 @@ class TissueClusters:
             pixel_mm: Pixel size (across, depth) in mm, for tissues that are clustered by millimetres.
 
         Raises:
-            InvalidValueError: If the slice is not a 2-D array of integers, or the tissues or the size are none.
+            InvalidValueError: If the slice is not a 2-D array of integers, or `tissues` or `pixel_mm` is not as above.
         """
         slice_xz = _checked_slice(slice_xz)
         rules = [(tissue.label, *tissue.neighbourhood(pixel_mm)) for tissue in check_tissues(tissues)]
@@ -94,8 +94,8 @@ class TissueClusters:
 def tissue_dice(slice_xz: NDArray[np.uint8], reference_xz: NDArray[np.uint8]) -> dict[str, float]:
     """Return the Dice coefficient of each landmark tissue in two slices of one shape, by its name.
 
-    It is twice the pixels that both have of the tissue, over the pixels that either has: 1 if they are the same, 0
-    if none is shared. Where neither slice shows the tissue, they agree: 1.
+    It is twice the number of pixels of the tissue that both slices share, over the sum of its pixels in each: 1 if they
+    are the same, 0 if none is shared. If neither slice shows the tissue, it is 1.
 
     Args:
         slice_xz: Labels of the slice, indexed [across, depth].
@@ -112,7 +112,7 @@ def tissue_dice(slice_xz: NDArray[np.uint8], reference_xz: NDArray[np.uint8]) ->
 def nerve_area_error(
     slice_xz: NDArray[np.uint8], reference_xz: NDArray[np.uint8], pixel_mm: tuple[float, float]
 ) -> tuple[float | None, float | None]:
-    """Return how far the median nerve's area is from that on a reference slice: in mm2, and in per cent of the latter.
+    """Return the absolute error of the median nerve's area against a reference slice: in mm2, and in per cent of it.
 
     Args:
         slice_xz: Labels of the slice, indexed [across, depth].
@@ -120,7 +120,7 @@ def nerve_area_error(
         pixel_mm: Pixel size of both slices, (across, depth) in mm.
 
     Returns:
-        The two, at least 0; None and None if the reference shows no nerve.
+        Both errors, at least 0; None and None if the reference shows no nerve.
     """
     shown, wanted = (int(np.count_nonzero(each == TISSUE_LABELS["nerve"])) for each in (slice_xz, reference_xz))
     if wanted == 0:

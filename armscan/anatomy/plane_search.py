@@ -1,8 +1,8 @@
-"""The optimal plane of a volume that has none: a search over planes for the middle of those that score best.
+"""Search an unlabelled volume for its optimal plane: the middle of the planes that score best.
 
-The reward is constant over whole regions of planes: there is not one best plane but many, and the one that a person
-marks lies well inside of them. So the planes of a coarse grid are scored, those about the largest connected region of
-best ones are scored again on a finer grid, and the middle of the region is the plane. Nothing is drawn at random.
+The reward is constant over whole regions of planes: there are many best planes, and the one that a person marks lies
+well inside such a region. The search scores a coarse grid, then a finer one around the largest connected region of best
+planes, and returns the middle of that region. It is deterministic.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ MAX_PLANES = 1_000_000
 NEIGHBOURS = np.ones((3, 3, 3))
 # Rewards that differ by rounding only are the same.
 SAME_REWARD = 1e-9
-# Turned further, a plane hardly crosses the arm any more.
+# Rotated further, a plane hardly crosses the arm.
 MAX_ANGLE_DEG = 80.0
 
 
@@ -52,7 +52,7 @@ class FoundPlane:
 
 @dataclass(frozen=True)
 class PlaneGrid:
-    """Planes at even steps; a pose (rz, rx, along) is two rotations in degrees and the slice centre's y in mm.
+    """A regular grid of planes; a pose (rz, rx, along) is two rotations in degrees and the slice centre's y in mm.
 
     Args:
         lowest: Pose of the first plane, shape (3,).
@@ -77,19 +77,19 @@ class PlaneGrid:
         return cls(lowest, (highest - lowest) / n_steps, (n_rz, n_rx, n_along))
 
     def finer_about(self, region: NDArray[np.int64]) -> Self:
-        """Return the planes at half the steps in the box that a region's planes and their neighbours lie in."""
+        """Return a grid of half the steps over the bounding box of a region's planes and their neighbours."""
         first = np.maximum(region.min(axis=0) - 1, 0)
         last = np.minimum(region.max(axis=0) + 1, np.subtract(self.shape, 1))
         n_rz, n_rx, n_along = (int(n) for n in 2 * (last - first) + 1)
         return type(self)(self.pose(first), self.steps / 2, (n_rz, n_rx, n_along))
 
     def pose(self, index: NDArray[np.int64] | FloatArray) -> FloatArray:
-        """Return the pose at an index, shape (..., 3), between two planes where it is not whole."""
+        """Return the pose at an index, shape (..., 3); a fractional index lies between planes."""
         pose: FloatArray = self.lowest + index * self.steps
         return pose
 
     def rewards(self, judge: PlaneScorer) -> FloatArray:
-        """Return the reward of each plane; -1 if no plane within the bounds of an action has the pose."""
+        """Return the reward of each plane; -1 if its origin cannot lie within the volume."""
         rewards = np.full(self.shape, -1.0)
         for index in np.ndindex(self.shape):
             plane = plane_at(judge.volume, self.pose(np.array(index)))
@@ -124,10 +124,10 @@ def find_optimal_plane(
     targets: Sequence[int] = PUBLISHED_TARGETS,
     clustering: str | Tissues = "pixels",
 ) -> FoundPlane:
-    """Find the plane in the middle of those that the landmark reward likes best.
+    """Find the plane in the middle of those with the best landmark reward.
 
-    A plane that the volume is already labelled with is not looked at. Where the best planes reach to the limits of the
-    rotations, the middle is that of the part within.
+    A plane that the volume is already labelled with is ignored. If the best planes extend beyond the rotation limits,
+    the middle is taken of the part within.
 
     Args:
         volume: Volume to search, over its whole length.
@@ -169,7 +169,7 @@ def find_optimal_plane(
     fine_rewards = fine.rewards(judge)
     region = largest_best_region(fine_rewards)
 
-    # Where the region is bent, its middle can lie outside of it: then the nearest of its planes is taken.
+    # The middle of a region that is not convex can lie outside it: then its nearest plane is taken.
     middle = region.mean(axis=0)
     nearest = region[np.linalg.norm(region - middle, axis=1).argmin()]
     planes = [plane for index in (middle, nearest) if (plane := plane_at(volume, fine.pose(index))) is not None]
@@ -189,7 +189,7 @@ def largest_best_region(rewards: FloatArray) -> NDArray[np.int64]:
 
 
 def plane_at(volume: LabelVolume, pose: FloatArray) -> ManipulatorAction | None:
-    """Return the plane of a pose, its slice in the volume's middle across; None if its origin lies outside."""
+    """Return the plane of a pose, its slice centred on the volume across; None if its origin cannot lie within it."""
     rz, rx, along_mm = (float(component) for component in pose)
     turned = ManipulatorAction((rz, rx), (0.0, 0.0))
     centre_x, _, centre_z = volume.centre_mm

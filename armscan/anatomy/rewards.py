@@ -15,9 +15,9 @@ from armscan.utils.validation import check_float, check_ints
 from armscan.volumes.volume import LabelVolume
 
 PUBLISHED_TARGETS = (4, 3, 1)
-# Default of an environment, whose episodes end above -success_threshold.
+# Default of an environment, in which a reward above -success_threshold is a success.
 SUCCESS_THRESHOLD = 0.05
-# Multiplying by it, where a division would do, gives the published figures to the last bit.
+# Multiplying by it, instead of dividing, reproduces the published figures to the last bit.
 THIRD = 1 / 3
 
 
@@ -27,7 +27,7 @@ class Reward(Protocol):
     def fit(self, volumes: Iterable[LabelVolume], tissues: Tissues = PIXEL_TISSUES) -> Reward:
         """Return the reward fitted to the labelled planes of training volumes; a fitted one is returned unchanged.
 
-        `tissues` has the clustering rules of their slices.
+        `tissues` holds the clustering rules for their slices.
         """
 
     def score(self, landmarks: Landmarks, pixel_mm: tuple[float, float]) -> float:
@@ -37,9 +37,9 @@ class Reward(Protocol):
 class LandmarkReward:
     """The published reward: 0 where every landmark is there and in its place.
 
-    The mean of three terms, each 0 at best: how far the cluster counts are from their targets (over the targets' sum),
-    the share of tissues with no cluster, and 1 if the tendons are not between the bones and the single artery in
-    depth.
+    It is minus the mean of three penalties, at least -1: how far the cluster counts are from their targets (over the
+    targets' sum), the fraction of tissues without a cluster, and 1 if the tendons are not between the bones and the
+    single artery in depth.
 
     Args:
         targets: Target counts: clusters of bones, tendons and artery that the wanted plane shows. (4, 3, 1), or (7, 5,
@@ -53,7 +53,7 @@ class LandmarkReward:
         self.targets = check_targets(targets)
 
     def fit(self, volumes: Iterable[LabelVolume], tissues: Tissues = PIXEL_TISSUES) -> Self:
-        """Return the reward as it is: it takes nothing from volumes."""
+        """Return the reward unchanged: it needs no fitting."""
         return self
 
     def score(self, landmarks: Landmarks, pixel_mm: tuple[float, float]) -> float:
@@ -67,25 +67,23 @@ class LandmarkReward:
 
 
 class AgreementReward(LandmarkReward):
-    """The mean of the published reward and of how well sizes and positions agree with the labelled planes.
+    """The mean of the published reward and the agreement of sizes and positions with the labelled planes.
 
-    The published reward is 0 up to 10 mm and 15 degrees away from a labelled plane. This one also looks at seven
-    features of a slice: the clustered area of each tissue, and how far the mean centres of tendons and artery are from
-    that of the bones, across and in depth. A feature costs nothing inside the range that the labelled planes of the
-    training volumes span, and the more the further outside, up to 1; the agreement is minus the mean of the costs. So
-    a labelled plane of the training volumes scores 0.
+    The published reward is 0 up to 10 mm and 15 degrees away from a labelled plane. The agreement rates seven features
+    of a slice: the clustered area of each tissue, and how far the mean centres of tendons and artery are from the
+    bones', across and in depth. A feature costs nothing inside the range that the labelled planes of the training
+    volumes span; outside, its cost rises to at most 1. The agreement is minus the mean cost: 0 on each of these planes.
 
-    Distances are between tissues and without sign, so that they are the same for left and right hands, and do not
-    change when the picture is shifted.
+    Distances are unsigned and between tissues, so that they are the same for left and right hands, and do not change
+    when the slice is shifted.
 
     Args:
         targets: Target counts of the published reward.
-        area_tolerance: Distance outside its range at which an area has its full cost, as a share of the nearer end,
-            from 0.001 to 1000.
-        distance_tolerance_mm: Distance outside its range, in mm, at which a distance has its full cost, from 0.001 to
-            1000.
-        slack: Share of each end by which the range of an area is widened, from 0 to 1, because the pixels of the same
-            plane differ a little from one motion of the volume to another.
+        area_tolerance: Distance outside its range at which an area costs 1, as a fraction of the nearer end, from 0.001
+            to 1000.
+        distance_tolerance_mm: Distance outside its range, in mm, at which a distance costs 1, from 0.001 to 1000.
+        slack: Fraction of each end by which the range of an area is widened, from 0 to 1, because the pixels of one
+            plane differ slightly between motions of the volume.
         slack_mm: Width in mm by which the range of a distance is widened at both ends, from 0 to 1000.
     """
 
@@ -187,7 +185,7 @@ class Range(NamedTuple):
 
 
 def _features(landmarks: Landmarks, pixel_mm: tuple[float, float]) -> list[float | None]:
-    """Return areas of bones, tendons, artery in mm2, distances of tendons, artery from bones in mm; None: absent."""
+    """Return areas of bones, tendons, artery in mm2, distances of tendons, artery to bones in mm, None if absent."""
     across_mm, depth_mm = pixel_mm
     bones, *others = landmarks.tolist()
     features: list[float | None] = [n_pixels * across_mm * depth_mm for _, n_pixels, _, _ in (bones, *others)]
@@ -207,7 +205,7 @@ def landmark_reward(clusters: TissueClusters, targets: Sequence[int] = PUBLISHED
         targets: Target counts: clusters of bones, tendons and artery that the wanted plane shows.
 
     Raises:
-        InvalidValueError: If `targets` is not three whole numbers from 1 to 1000, or `clusters` none.
+        InvalidValueError: If `targets` is not three whole numbers from 1 to 1000, or `clusters` no `TissueClusters`.
     """
     if not isinstance(clusters, TissueClusters):
         raise InvalidValueError(f"clusters is {clusters!r}, but it must be a TissueClusters")
@@ -221,7 +219,7 @@ def check_targets(targets: Sequence[int]) -> tuple[int, int, int]:
 
 
 def check_reward(reward: Reward | None, targets: Sequence[int]) -> Reward:
-    """Return a reward given as such, or by the targets of the published one."""
+    """Return the given reward, or the published one with these targets if it is None."""
     targets = check_targets(targets)
     if reward is None:
         return LandmarkReward(targets)

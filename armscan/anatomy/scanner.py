@@ -1,4 +1,4 @@
-"""One look at a plane, compiled: the slice and the summary of its clusters; and many looks at once, on all cores."""
+"""Compiled look at a plane: its slice and the summary of its clusters; for one plane, or for many on all cores."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from armscan.volumes.slicing import sample_plane
 from armscan.volumes.volume import LabelVolume
 
 Depths = NDArray[np.int32]
-# Planes that a thread takes at once: few, so that where one core is busy with other work, the others take more of them,
-# but enough that it pays to wake a thread for them.
+# Planes that a thread takes at once: few, so that other threads take over from one on a busy core, but enough to be
+# worth waking a thread.
 N_AT_ONCE = 4
 
 
@@ -43,7 +43,7 @@ def _look(
     slice_xz: Pixels,
     landmarks: Landmarks,
 ) -> None:
-    """Fill a slice and its summary; `half_widths` has for each volume a row a tissue, ended by -1."""
+    """Fill a slice and its summary; `half_widths` has a row for each volume and tissue, padded with -1."""
     s_x, s_y, s_z = spacings_mm[which]
     matrix, offset_mm = mapped_plane(maps, rotation, translation)
     sample_plane(labels_yxz, occupied, (s_x, s_y, s_z), matrix, offset_mm, slice_xz)
@@ -67,7 +67,7 @@ def _look_all(
     slices: Pixels,
     landmarks: FloatArray,
 ) -> None:
-    """Look at the planes i of the volumes `which[i]`, as `_look`; row i of `slices` begins with slice i."""
+    """Look at each plane i in volume `which[i]`, as `_look` does; row i of `slices` begins with slice i."""
     rules = spacings_mm, tissue_labels, half_widths, min_samples
     for i in range(which.size):
         labels_yxz, occupied = volumes[which[i]]
@@ -79,15 +79,15 @@ def _look_all(
 
 @functools.cache
 def _threads(pid: int, n_threads: int) -> ThreadPoolExecutor:
-    """Return the threads of a process; a fork has none of its parent's.
+    """Return the thread pool of a process; a fork does not inherit its parent's threads.
 
-    Numba's own would kill a fork that looks: GNU's OpenMP cannot be used on both sides of one.
+    Numba's own pool would kill a forked process: GNU OpenMP cannot be used both before and after a fork.
     """
     return ThreadPoolExecutor(n_threads, thread_name_prefix=f"scanner-{pid}")
 
 
 class Scanner:
-    """Looks at planes of some volumes.
+    """Samples planes of volumes and clusters what they show.
 
     Args:
         volumes: Volumes; planes name them by their index in this sequence.
@@ -148,7 +148,7 @@ class Scanner:
         volumes = self._typed_volumes
         shapes = [self._shapes[i] for i in which]
         longest = max(n_across * n_depth for n_across, n_depth in shapes)
-        # Rows of whole words, so that each begins with one.
+        # Rows are whole words, so that each row is aligned.
         slices = np.empty((len(which), -(-longest // WORD) * WORD), dtype=np.uint8)
         landmarks = np.empty((len(which), N_TISSUES, 4))
 
@@ -164,7 +164,7 @@ class Scanner:
         helpers = [_threads(os.getpid(), n_threads).submit(look_at_rest) for _ in range(n_helpers)]
         look_at_rest()
         for helper in helpers:
-            # One that has not begun would find nothing left.
+            # A helper that has not begun would find nothing left.
             if not helper.cancel():
                 helper.result()
         return [

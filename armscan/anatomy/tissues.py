@@ -1,4 +1,4 @@
-"""The landmark tissues and how their pixels in a slice are clustered: by pixels, as published, or by millimetres."""
+"""The landmark tissues and how their pixels in a slice are clustered: in pixels, as published, or in millimetres."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from armscan.utils.validation import check_float, check_int, check_numbers
 
 USUAL_PIXEL_MM = (0.27, 0.55)
 N_TISSUES = 3
-# A pixel at exactly eps is a neighbour, also where its spacing was kept as a 32-bit float.
+# A pixel at exactly eps is a neighbour, even if the spacing was stored as a 32-bit float.
 ROUNDING = 1.0 + 1e-6
 MAX_EPS_PX = 1000.0
-# More than a disc of the largest radius has pixels.
+# More pixels than a disc of the largest radius has.
 MAX_SAMPLES = 10_000_000
 
 
 class Neighbourhood(NamedTuple):
-    """Rule for core pixels: at least `min_samples` pixels in the disc of these half widths about it."""
+    """Rule for core pixels: at least `min_samples` pixels of the tissue in the disc with these half widths."""
 
     half_widths: IntArray
     min_samples: int
@@ -35,12 +35,12 @@ class Tissue(Protocol):
         """Its value in a labelmap."""
 
     def neighbourhood(self, pixel_mm: tuple[float, float]) -> Neighbourhood:
-        """Return the neighbourhood that makes a core pixel, for pixels of this size, (across, depth)."""
+        """Return the neighbourhood that makes a core pixel, for pixels of this size, (across, depth) in mm."""
 
 
 @dataclass(frozen=True)
 class PixelTissue:
-    """A tissue clustered by pixels of any size; DBSCAN on the pixel coordinates.
+    """A tissue clustered by DBSCAN on pixel coordinates, whatever the size of a pixel.
 
     Args:
         label: Label of the tissue in a labelmap.
@@ -64,13 +64,13 @@ class PixelTissue:
 
 @dataclass(frozen=True)
 class MetricTissue:
-    """A tissue clustered by millimetres, so that one setting serves every spacing; DBSCAN on coordinates in mm.
+    """A tissue clustered by DBSCAN on coordinates in mm, so that one setting serves every spacing.
 
     Args:
         label: Label of the tissue in a labelmap.
         eps_mm: Neighbourhood radius in mm.
-        density: Share of the pixels within `eps_mm` that must be of this tissue (mm² of tissue per mm²), in (0, 1], to
-            make a core pixel. The pixel itself counts.
+        density: Fraction of the pixels within `eps_mm`, the pixel itself included, that must be of this tissue to make
+            a core pixel, in (0, 1].
     """
 
     label: int
@@ -111,7 +111,7 @@ PIXEL_TISSUES = Tissues(
     PixelTissue(label=3, eps_px=1.1, min_samples=4),
 )
 
-# Finds what the pixel mode finds at its own spacing, and the same at others, for pixels of up to about 0.55 mm.
+# Finds the same as the pixel mode at its own spacing, and at any other with pixels of up to about 0.55 mm.
 METRIC_TISSUES = Tissues(
     MetricTissue(label=1, eps_mm=1.6, density=0.94),
     MetricTissue(label=2, eps_mm=1.2, density=0.62),
@@ -121,7 +121,7 @@ CLUSTERINGS: dict[str, Tissues] = {"pixels": PIXEL_TISSUES, "metric": METRIC_TIS
 
 
 def check_tissues(clustering: str | Tissues) -> Tissues:
-    """Return the tissues, given as such or by the name of their clustering."""
+    """Return clustering rules given as `Tissues` or by name."""
     if isinstance(clustering, str) and clustering in CLUSTERINGS:
         return CLUSTERINGS[clustering]
     if not isinstance(clustering, Tissues):

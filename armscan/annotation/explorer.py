@@ -61,7 +61,7 @@ class Explorer:
         self._tissues = tissues
         self._is_setting = False
         self.figure, self._image = opened("armscan", np.full((HEIGHT, WIDTH, 3), BACKGROUND, np.uint8), HEIGHT_BELOW)
-        # Nothing else holds the widgets, and without their owner they no longer hear what is done to them.
+        # Nothing else holds a reference to the widgets, and without one they no longer respond.
         setattr(self.figure, "explorer", self)  # noqa: B010
         self.sliders = {component: self._slider(row, component) for row, component in enumerate(COMPONENTS)}
         self.optimum_button = self._button(0, self.go_to_optimum)
@@ -87,7 +87,7 @@ class Explorer:
         self.go_to(ManipulatorAction((0.0, 0.0), (0.0, along_mm / 2)))
 
     def next_volume(self, n_further: int = 1) -> None:
-        """Go to the volume `n_further` places after the current one, in a circle."""
+        """Go to the volume `n_further` places after the current one, wrapping around."""
         names = list(self.volumes)
         self.choose(names[(names.index(self.volume.name) + n_further) % len(names)])
 
@@ -142,7 +142,7 @@ class Explorer:
         )
         for text in (slider.label, slider.valtext):
             text.set_color(_rgb(INK))
-        # Drawn with the picture, once.
+        # Drawn together with the picture.
         slider.drawon = False
         slider.on_changed(self._look)
         return slider
@@ -176,11 +176,11 @@ def explore(
         clustering: Clustering rules: `pixels`, `metric`, or an `armscan.anatomy.Tissues`.
 
     Returns:
-        The figure with its widgets; the figure keeps it for as long as it is open.
+        The explorer; its figure keeps it alive while it is open.
 
     Raises:
         DisplayError: If no window can be opened.
-        InvalidValueError: If an argument is outside what is allowed.
+        InvalidValueError: If an argument is invalid.
         VolumeError: If the folder or a file cannot be used.
         ManifestError: If the folder's manifest is damaged.
     """
@@ -195,7 +195,7 @@ def explore(
 
 
 def reachable_optimum(volume: LabelVolume) -> ManipulatorAction | None:
-    """Return a volume's optimal plane with its origin within the volume, None if there is none of that kind."""
+    """Return a volume's optimal plane with its origin within the volume; None if that is not possible or not known."""
     sampler = SceneSampler(rotation_bounds_deg=(BOUND_DEG, BOUND_DEG), translation_bounds_mm=None, transform=None)
     try:
         return sampler.unmoved(volume).optimum
@@ -212,6 +212,6 @@ def _named(volumes: LabelVolume | Volumes) -> dict[str, LabelVolume]:
 
 
 def _rgb(ink: Ink) -> tuple[float, float, float]:
-    """Return a colour as Matplotlib takes it."""
+    """Return a colour in Matplotlib's form."""
     red, green, blue = (part / 255 for part in ink)
     return red, green, blue

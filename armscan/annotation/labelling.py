@@ -1,4 +1,4 @@
-"""Labelling a folder: volume by volume a plane that is found or was drawn, into the manifest and a picture of it."""
+"""Label a folder: find or read a plane for each volume, and write it into the manifest and as a picture."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ class LabellingOptions:
         overwrite: Whether to label volumes that already have a plane.
         pictures: Folder for the pictures; created if it does not exist.
         markups: Whether to write a markups file for 3D Slicer beside each picture.
-        markup: Markups file with the plane of `volume`, which is used instead of a search.
-        volume: Name of the only volume to label, even if it already has a plane.
+        markup: Markups file with the plane of `volume`, which replaces the search.
+        volume: Name of the volume that `markup` is for; it may already have a plane.
     """
 
     data: Path
@@ -52,8 +52,8 @@ def label(request: LabellingOptions) -> tuple[list[tuple[LabelVolume, FoundPlane
     """Find or read a plane for each volume, draw it and write it into the manifest, volume by volume.
 
     Returns:
-        The volumes, with the plane that each had before, and the planes that are now in the manifest; and for which
-        volumes none was found.
+        The volumes, with the plane that each had before, and their planes now in the manifest; and an error for each
+        volume without a plane.
     """
     dataset = open_dataset(request.data, require_manifest=False)
     volumes = _wanted(request, dataset)
@@ -71,7 +71,7 @@ def label(request: LabellingOptions) -> tuple[list[tuple[LabelVolume, FoundPlane
         except OptimalPlaneError as error:
             failures.append(error)
             continue
-        # The manifest last: no plane stands there that nobody can look at.
+        # The manifest last: every plane in it then has a picture.
         _make_folder(request.pictures)
         _write_picture(request.pictures / f"{name}.png", volume, plane.action, request.tissues)
         if request.markups:
@@ -101,7 +101,7 @@ def _drawn(markup: Path, volume: LabelVolume, tissues: Tissues) -> FoundPlane:
 
 
 def _write_known_markups(request: LabellingOptions, volumes: dict[str, LabelVolume], to_label: set[str]) -> None:
-    """Write the planes that are there already, and stay, so that they can be corrected too."""
+    """Write the existing planes that are not searched for again, so that they can be corrected too."""
     for name, volume in volumes.items():
         is_asked_for = request.volumes is None or name in request.volumes
         if is_asked_for and name not in to_label and volume.optimal_action is not None:
@@ -119,7 +119,7 @@ def _make_folder(folder: Path) -> None:
 
 
 def _write_picture(path: Path, volume: LabelVolume, action: ManipulatorAction, tissues: Tissues) -> None:
-    """Draw the slice, and the plane from two sides; beside it the plane that the volume had before, if any."""
+    """Draw the slice, and the plane from two sides beside the one that the volume had before, if any."""
     beside = None if volume.optimal_action is None else ReferencePlane(volume.optimal_action, "former plane")
     picture = Image.fromarray(draw_plane(volume, action, view_of(volume, action, tissues=tissues), beside=beside))
     try:

@@ -32,10 +32,10 @@ def data() -> None:
 @data.command(epilog=examples("data inspect wrists"))
 @click.argument("folder")
 def inspect(folder: str) -> None:
-    """Print the contents of the volumes of FOLDER.
+    """Print the contents of the volumes in FOLDER.
 
-    The volumes are read as the manifest says: their tissues, and what is missing or ignored. docs/manifest.md describes
-    the manifest, which may be missing.
+    Volumes are read through the manifest, if there is one; their tissues, and what is missing or ignored, are listed.
+    docs/manifest.md describes the manifest.
     """
     # Deferred: `--help` needs none of it.
     from armscan.volumes import open_dataset
@@ -112,7 +112,7 @@ def label(
 @click.option("--volume", metavar="NAME", help="Volume to begin with.  [default: the first]")
 @clustering_option
 def explore(folder: str | None, volume: str | None, clustering: str | None) -> None:
-    """Move the plane by sliders in a window.
+    """Move the plane with sliders in a window.
 
     FOLDER holds the volumes, with a manifest or without. Default: phantom wrists.
 
@@ -128,7 +128,7 @@ def explore(folder: str | None, volume: str | None, clustering: str | None) -> N
 
 def _print_dataset(dataset: Dataset) -> None:
     """Print a table for each volume, and the excluded volumes."""
-    # Broken between words.
+    # Lines of a file or a pipe are never wrapped.
     console = wide_console(WHOLE_CHARS)
     for name, report in dataset.reports.items():
         plane = "a labelled plane" if dataset.volumes[name].optimal_action else "no labelled plane"

@@ -117,7 +117,7 @@ def evaluate(
     _check_options(agent, data, tracking_experiment, video=video)
     folder = None if data == "phantom" else data
     print(f"preparing {f'run {run[0]}' if agent is None else f'agent={agent}'}", flush=True)
-    # Deferred: a mistake on the command line is answered before these are loaded.
+    # Deferred: command-line errors are reported before these are loaded.
     from armscan import evaluation
     from armscan.config.defaults import default_tracking
     from armscan.evaluation.runner import apply
@@ -171,7 +171,7 @@ def _evaluate(
 
 
 def _check_options(agent: str | None, data: str | None, tracking_experiment: str | None, *, video: bool) -> None:
-    """Raise an error if options do not go together, or there is no such folder."""
+    """Raise an error if options exclude each other, or the folder does not exist."""
     if is_given("phantoms") and data != "phantom":
         number = click.get_current_context().params["phantoms"]
         raise click.UsageError(f"--phantoms is {number}, but it is for --data phantom")

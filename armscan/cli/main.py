@@ -23,7 +23,7 @@ INTERRUPTED = 130
 
 
 class PassedOn(click.Command):
-    """A command that takes its arguments as they are, options included."""
+    """A command that receives its arguments unparsed, options included."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Keep the arguments for the command."""
@@ -58,7 +58,7 @@ def armscan() -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the program; answer a user's mistake in one line.
+    """Run the program; report a user's mistake in one line.
 
     Args:
         arguments: Arguments of the command line. Default: those of this process.

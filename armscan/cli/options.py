@@ -1,4 +1,4 @@
-"""Shared by the commands: types of values, options, examples."""
+"""Parameter types, options and examples that the commands share."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def examples(*lines: str) -> str:
 
 
 class FilePath(click.ParamType[Path]):
-    """A path that is not empty: that of an unset variable would be the working folder."""
+    """A path that is not empty: an unset shell variable would otherwise mean the working folder."""
 
     name = "path"
 
@@ -39,7 +39,7 @@ FILE_PATH = FilePath()
 
 
 class UriParam(click.ParamType[str]):
-    """The address of a store; without a password, which everybody on this machine could read."""
+    """The address of a store, without a password: every user of this machine can read command lines."""
 
     name = "URI"
 
@@ -56,7 +56,7 @@ class CommaSeparated(click.ParamType[tuple[str, ...]]):
 
     Args:
         metavar: Placeholder of the value in the help text.
-        choices: Allowed values. Default: any but an empty one.
+        choices: Allowed values. Default: any non-empty value.
     """
 
     name = "list"
@@ -65,7 +65,7 @@ class CommaSeparated(click.ParamType[tuple[str, ...]]):
         self._metavar, self._choices = metavar, choices
 
     def get_metavar(self, param: click.Parameter, ctx: click.Context) -> str:
-        """Return how help names the value."""
+        """Return the placeholder that help shows."""
         return f"{self._metavar},..."
 
     def convert(self, value: str, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, ...]:

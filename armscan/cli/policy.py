@@ -33,7 +33,7 @@ def export(run: str, out: Path, tracking: str, trust: bool) -> None:
     RUN is an MLflow run ID or its first four or more characters. The model is made from the checkpoint of the run;
     docs/policy.md describes its input and output.
     """
-    # Deferred: a mistake on the command line is answered before these are loaded.
+    # Deferred: command-line errors are reported before these are loaded.
     from armscan.policies.model import is_model, others_in
     from armscan.runs.policy_registry import export_policy
 

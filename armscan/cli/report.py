@@ -13,9 +13,9 @@ from armscan.cli.options import FILE_PATH, examples, is_given, storage_option, t
 from armscan.errors import InvalidValueError, StudyError, listed
 from armscan.utils.files import nearest_existing
 
-# Between two writings of a report that is watched.
+# Seconds between two updates of a watched report.
 WATCH_S = 10
-# The option with the place of what the report is of.
+# The option with the store of each kind of report.
 PLACES = {"study": "storage", "runs": "tracking"}
 
 
@@ -50,7 +50,7 @@ def report(study: str | None, runs: str | None, out: Path | None, watch: bool, s
         if not nearest.is_dir():
             raise InvalidValueError(f"--out is {str(out)!r}, but {nearest} is not a folder: name one, or a new one")
     if runs is not None:
-        # Deferred: a mistake on the command line is answered before these are loaded.
+        # Deferred: command-line errors are reported before these are loaded.
         from armscan.reports.runs import compare_runs
 
         file = compare_runs(runs, tracking, None if out is None else str(out))
@@ -64,7 +64,7 @@ def report(study: str | None, runs: str | None, out: Path | None, watch: bool, s
 
 
 def _watch(write: Callable[[int | None], Path]) -> None:
-    """Rewrite a report until Ctrl-C, and then for the last time."""
+    """Rewrite a report until Ctrl-C, then write it once more, without the automatic refresh."""
     from armscan.errors import StorageUnavailableError
     from armscan.utils.retry import no_retry
 
@@ -72,7 +72,7 @@ def _watch(write: Callable[[int | None], Path]) -> None:
     try:
         while True:
             time.sleep(WATCH_S)
-            # What is there stays as it is until the storage is back.
+            # While the storage is unavailable, the report stays as it is.
             with contextlib.suppress(StorageUnavailableError), no_retry():
                 write(WATCH_S)
     finally:

@@ -114,7 +114,7 @@ def show(run: str, tracking: str) -> None:
 def prune(what: str, apply: bool, tracking: str, sort: str, limit: int | None, **selected: Any) -> int:
     """Remove checkpoints or folders of ended runs.
 
-    checkpoints: from their folders. folders: all of their files on this machine. The store is left as it is: MLflow
+    checkpoints: those in their folders. folders: all of their files on this machine. The store is not changed: MLflow
     deletes runs and artifacts. docs/runs.md says what is never removed.
     """
     from rich.filesize import decimal
@@ -148,7 +148,7 @@ def stop(target: str, storage: str, tracking: str) -> None:
 
     STUDY is the name of a study: its trials are requeued at their next report, and the same command resumes it.
     RUN is an MLflow run ID or its first four or more characters. A trial ends at its next report, as pruned, and counts
-    as finished; a run that is of no study is interrupted as by Ctrl-C.
+    as finished; a run outside a study is interrupted as by Ctrl-C.
     """
     from armscan.runs.stop import interrupt, target_of
     from armscan.sweeps.stop import is_study, stop_study, stop_trial
@@ -211,14 +211,14 @@ def sync(folder: Path, tracking: str | None, trust: bool) -> int:
 def reproduce(run: str, dry_run: bool, out: Path | None, tracking: str, trust: bool) -> int:
     """Repeat a run, and compare every metric.
 
-    RUN is an MLflow run ID or its first four or more characters. Nothing is checked out or installed: what differs in
-    code, packages and machine is listed. The volumes must be the same. The new run has the configuration and the seed
+    RUN is an MLflow run ID or its first four or more characters. Nothing is checked out or installed: differences in
+    code, packages and machine are listed. The volumes must be the same. The new run has the configuration and the seed
     of the old one, and is tracked beside it. Exit code: 0 if all metrics are equal (with --dry-run: if nothing
     differs), else 1.
     """
     from armscan.utils.processes import limit_threads
 
-    # As a run is computed.
+    # As in `armscan run`.
     limit_threads()
     from armscan.runs import reproduce as reproduction
 

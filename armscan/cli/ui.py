@@ -25,8 +25,8 @@ def ui(storage: str, tracking: str, artifacts: Path, mlflow_port: int, dashboard
 
     Both are for this machine alone, until Ctrl-C.
 
-    A store that is named must exist; of the default ones, one may still be empty. An MLflow server has a UI of its own,
-    which is only named.
+    A store given by an option must exist; one of the two default stores may be missing. An MLflow server has its own
+    UI: only its address is printed.
     """
     # Deferred: `--help` needs none of it.
     from armscan.ui.show import show

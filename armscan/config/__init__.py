@@ -1,1 +1,1 @@
-"""Configuration: where it is, services, credentials, error messages."""
+"""Configuration: sources, composition, services, credentials, error messages."""

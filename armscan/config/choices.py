@@ -9,7 +9,7 @@ from omegaconf import OmegaConf
 
 from armscan.config.sources import CONF, SWEEP, SWEEPS, config_folder, own_folders, sweeps_folder
 
-# Groups that other configurations choose from, not people.
+# Groups that other configurations choose from, not users.
 HIDDEN = ("hydra/help", "study")
 MAX_CHARS = 100
 
@@ -27,7 +27,7 @@ def choices() -> dict[str, dict[str, Path]]:
 
 
 def summary(path: Path) -> str:
-    """Return the first sentence of the comment that a file begins with."""
+    """Return the first sentence of a file's leading comment."""
     lines = []
     for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
         if not line.startswith("#"):
@@ -45,7 +45,7 @@ def choices_help() -> str:
         if group not in (".", *HIDDEN):
             width = max(map(len, files)) + 2
             parts += [f"{group}=", *(f"  {name:{width}}{summary(path)}".rstrip() for name, path in files.items()), ""]
-    # Hydra fills in what follows a dollar sign.
+    # Hydra substitutes names that follow a dollar sign.
     return "\n".join(parts).replace("$", "$$")
 
 

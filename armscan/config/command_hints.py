@@ -15,9 +15,9 @@ from armscan.config.trust import TRUST
 from armscan.utils.files import SQLITE_PREFIX
 
 RUN = ("python", "-m", "armscan.run")
-# Where commands are typed; a resumed run enters another folder.
+# The user's working folder; a resumed run changes to another one.
 STARTED_IN = Path.cwd()
-# `uv run` says so to the programs that it starts.
+# `uv run` sets it for the programs that it starts.
 UV_RUN = "UV_RUN_RECURSION_DEPTH"
 
 
@@ -33,7 +33,7 @@ def typed(program: str) -> tuple[str, ...]:
 
 
 def kept_command(words: Iterable[str]) -> str:
-    """Return the command that runs these Hydra overrides, in the form that a run stores for any machine."""
+    """Return the command that runs these Hydra overrides, in the machine-independent form that a run stores."""
     return shlex.join([*RUN, *words])
 
 
@@ -59,8 +59,8 @@ def armscan_command(*words: str, tracking: str | None = None, storage: str | Non
 
     Args:
         words: The command and its arguments.
-        tracking: MLflow tracking URI; named in the command unless it is the default one. Default: None, no URI.
-        storage: Optuna storage; named in the command unless it is the default one. Default: None, no storage.
+        tracking: MLflow tracking URI, added unless it is the default one. Default: None, no URI.
+        storage: Optuna storage, added unless it is the default one. Default: None, no storage.
         trust: Whether the command needs `--trust`. Default: False.
     """
     stores = ["--storage", storage] if storage is not None and storage != default_storage() else []

@@ -1,4 +1,4 @@
-"""Compose the configuration; `./conf` and `./sweeps` of the working folder come before armscan's own."""
+"""Compose the configuration; `./conf` and `./sweeps` of the working folder take precedence over armscan's own."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from hydra.utils import instantiate
 from omegaconf import DictConfig, open_dict
 
-# They register the resolvers that the configuration uses.
+# Imported to register the resolvers that the configuration uses.
 from armscan.config import choices as choices
 from armscan.config import services as services
 from armscan.config.defaults import CLUSTER, to_plain
@@ -70,10 +70,10 @@ class SweepsSource(FileConfigSource):
 
 
 class OwnFolders(SearchPathPlugin):
-    """Add armscan's studies, and put the folders of the working folder before armscan's own."""
+    """Add armscan's studies, and search the folders of the working folder before armscan's own."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        """Add the folders, if it is armscan that is configured."""
+        """Add the folders, if the application is armscan."""
         if any(each.path == str(config_folder()) for each in search_path.get_path()):
             search_path.append(SWEEPS, f"{SWEEPS}://{sweeps_folder()}")
             for name, folder in own_folders().items():
@@ -92,13 +92,13 @@ def _print_replaced(names: tuple[str, ...]) -> None:
 
 @functools.cache
 def register() -> None:
-    """Register both classes with Hydra in this process."""
+    """Register both plugins with Hydra in this process."""
     for plugin in (SweepsSource, OwnFolders):
         Plugins.instance().register(plugin)
 
 
 def application(run: Callable[[DictConfig], None]) -> Callable[[], None]:
-    """Return a function as Hydra's application, which reads `sys.argv`."""
+    """Wrap a function as a Hydra application that reads `sys.argv`."""
     register()
     main: Callable[[], None] = hydra.main(str(config_folder()), CONFIG_NAME, VERSION_BASE)(run)
     return main
@@ -126,7 +126,7 @@ def of_run(config: DictConfig) -> tuple[DictConfig, dict[str, str]]:
     """Return the part of a composed configuration that describes a run, and the choice of each group."""
     choices = {str(group): str(choice) for group, choice in config.hydra.runtime.choices.items()}
     with open_dict(config):
-        # The store is the same, however it was given.
+        # Resolved first: its address may come from the section `cluster`, which is removed.
         config.tracking = to_plain(config.tracking)
         for section in ("study", "hydra", CLUSTER):
             config.pop(section, None)

@@ -9,7 +9,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from armscan.config.services import STORAGE, address_of
 from armscan.config.sources import config_file
 
-# The rules that an evaluation may change in one word, and where they stand in the configuration.
+# The rules that options of `armscan evaluate` change, and their keys in the configuration.
 CHANGES = {
     "success_threshold": "env.success_threshold",
     "max_steps": "env.max_steps",
@@ -19,22 +19,21 @@ CHANGES = {
     "device": "compute.device",
 }
 RESUME, TRACKING_URI = "resume", "tracking.uri"
-# Only shows what a study would run.
+# Prints what a study or a grid would run.
 PLAN = "--plan"
-# The services that many machines share.
+# The section with services that many machines share.
 CLUSTER = "cluster"
 # Hydra's options for several runs.
 MULTIRUN = ("-m", "--multirun")
-# What says where and how things are computed, kept and told, not what; and the seed, by which runs of the same thing
-# differ.
+# Keys that may differ between runs of the same experiment: how it is computed, tracked and reported, and the seed.
 NOT_COMPARED = ("tracking", "device", "compute.device", "seed", "evaluation.on_plane")
-# Keys that earlier versions did not have; null is what these did.
+# Keys that earlier versions did not have; null is their behaviour.
 ADDED = ("training.schedule",)
 # Of a cross-validation: the number of folds, and the fold that a run is tested on.
 FOLDS, FOLD = "data.folds", "data.fold"
 # Prefixes of keys that a study does not search.
 NOT_SEARCHED = ("study", "sweep", "tracking", "hydra", "seed")
-# The phantoms, where a command asks for volumes.
+# Stands for phantoms where a command takes a folder of volumes.
 PHANTOM = "phantom"
 
 

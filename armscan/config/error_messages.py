@@ -24,7 +24,7 @@ TRACEBACKS = "ARMSCAN_TRACEBACKS"
 
 
 def print_mistake(error: BaseException) -> bool:
-    """Print a user's mistake in one line; return False for any other error, and if tracebacks are wanted."""
+    """Print a user's mistake in one line; return False for any other error, or if the user wants tracebacks."""
     line = one_line_message(error)
     if line is None or os.environ.get(TRACEBACKS):
         return False
@@ -52,7 +52,7 @@ def one_line_message(error: BaseException) -> str | None:
             return f"{key}._target_ cannot be imported: {missing}; it must be in the current folder, or installed"
         case HydraException() | OmegaConfBaseException():
             return text
-        # Hydra's answer to an override such as obs=null.
+        # Raised by Hydra for an override such as obs=null.
         case ValueError() if _module_of(error).startswith("hydra."):
             return text
         case YAMLError() | UnicodeDecodeError():
@@ -65,14 +65,14 @@ def one_line_message(error: BaseException) -> str | None:
 
 
 def _named(message: str, section: str) -> str:
-    """Return a message whose keys of `agent` are named as those of the section in it that they were read from."""
+    """Return a message whose keys `agent.` name the nested section that they were read from, such as `agent.sac.`."""
     return message.replace("agent.", f"{section}.") if section.startswith("agent.") else message
 
 
 def _ours(error: BaseException | None) -> ArmscanError | None:
-    """Return the error of armscan that this one is, or was raised for."""
+    """Return the first error of armscan in a chain of causes; None if there is none."""
     while error is not None and not isinstance(error, ArmscanError):
-        # OmegaConf names no cause of an error that a resolver has raised.
+        # OmegaConf sets only the context of an error that a resolver has raised, not its cause.
         error = error.__context__ if isinstance(error, OmegaConfBaseException) else error.__cause__
     return error
 

@@ -1,7 +1,6 @@
-"""Configurations of earlier versions: keys and classes that have other names now.
+"""Configurations of earlier versions: keys and classes that have been renamed.
 
-Files of runs and attributes of studies keep the names that they were written with; `migrate` is applied where they are
-read.
+Files of runs and attributes of studies keep the names that they were written with; `migrate` renames them on reading.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ RENAMED_KEYS = {
     "env.delta": "env.success_threshold",
     "training.epoch_env_steps": "training.eval_every_env_steps",
 }
-# Of a study, whose section no run keeps.
+# In the section `study`, which runs do not store.
 RENAMED_KEYS_OF_STUDIES = {"study.final_eval.n_seeds": "study.final_eval.judge_seeds"}
 INVERTED = ("agent.judged_by_sampling",)
 # Truth values of a configuration, and of MLflow's parameters.

@@ -18,7 +18,7 @@ from armscan.errors import InvalidValueError, listed
 STORAGE, TRACKING = "storage", "tracking_uri"
 VARIABLES = {STORAGE: "ARMSCAN_STORAGE", TRACKING: "MLFLOW_TRACKING_URI"}
 RESOLVER = "armscan.service"
-# Of `armscan ui` on 127.0.0.1. The notes of trials link to the first.
+# Ports of `armscan ui` on 127.0.0.1. The notes of trials link to the first.
 MLFLOW_PORT, DASHBOARD_PORT = 5000, 8080
 
 
@@ -32,7 +32,7 @@ def address_of(name: str, default: str | None = None) -> str:
 
     Args:
         name: Name of the service: `storage`, where studies are kept, or `tracking_uri`, where runs are tracked.
-        default: Address to use if no variable is set; None requires one, in a variable or in `services_file`.
+        default: Address to use if the variable is not set. Default: None, the one in `services_file`.
 
     Raises:
         InvalidValueError: If there is no address, it has a password, or the file is damaged.

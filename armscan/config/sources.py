@@ -33,14 +33,14 @@ def sweeps_folder() -> Path:
 def working_folder() -> Path:
     """Return the working directory under the name by which the user entered it.
 
-    Other machines may know that name, but not what a link or a mount of this machine leads to.
+    Other machines may know that name, but not the target of a link or a mount on this machine.
     """
     called = Path(os.environ.get("PWD", ""))
     return called if called.is_absolute() and called.is_dir() and called.samefile(".") else Path.cwd()
 
 
 def own_folders() -> dict[str, Path]:
-    """Return `./conf` and `./sweeps` by name, as far as they exist; none in armscan's own checkout."""
+    """Return `./conf` and `./sweeps` by name, if they exist; none in armscan's own checkout."""
     here, ours = working_folder(), config_folder()
     folders = {name: here / name for name in (CONF, SWEEPS) if (here / name).is_dir()}
     is_checkout = CONF in folders and folders[CONF].samefile(ours)

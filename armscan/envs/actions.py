@@ -20,14 +20,14 @@ PROJECTIONS: dict[str, tuple[str, ...]] = {
     "zy": ("rz", "ty"),
     "full": COMPONENTS,
 }
-# The component, after those of the plane, by which an agent ends an episode where `ends` is `on_stop`: above 0.
+# The last component of an action if `ends` is `on_stop`: above 0, it ends the episode.
 STOP = "stop"
 MAX_TRANSLATION_MM = 1e6
 
 
 @dataclass(frozen=True)
 class ActionBounds:
-    """Meaning of the normalised vector (rz, rx, tx, ty) in [-1, 1]^4.
+    """Bounds of a plane's components, which scale the normalised vector (rz, rx, tx, ty) in [-1, 1]^4.
 
     Rotation is a * bound, translation (a + 1) / 2 * bound; a zero bound fixes its component at 0.
 

@@ -26,7 +26,7 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
     """Moves a slicing plane through a labelmap of an arm until the slice shows the carpal tunnel.
 
     ## Description
-    An episode is played on one volume, drawn at random and moved by a random rigid motion. Each action places the plane
+    An episode uses one volume, drawn at random and moved by a random `transform`. Each action places the plane
     (absolute, not relative to the last one). The environment samples the slice and clusters its landmarks.
 
     ## Action space
@@ -36,9 +36,9 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
     are clipped; NaN, infinity or another shape raises `InvalidValueError`.
 
     ## Observation space
-    The parts of the chosen observation, then `action`, the last one (n_action), and `reward`, that of the current slice
-    (1). If all of them are vectors, they form one flat `Box` of 32-bit floats; otherwise a `MultiBoxSpace`, a `Dict` of
-    boxes. `flat` overrides this.
+    The parts of the chosen observation, then `action`, the last action, shape (n_action,), and `reward`, the current
+    slice's, shape (1,). If all of them are vectors, they form one flat `Box` of 32-bit floats; otherwise a
+    `MultiBoxSpace`, a `Dict` of boxes. `flat` overrides this.
 
     | observation | part before action and reward | shape |
     | --- | --- | --- |
@@ -54,7 +54,7 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
     lie between bones and artery; or another `reward`.
 
     ## Starting state
-    The fixed components at the optimum; the free ones at normalised 0 (`start="middle"`) or drawn (`start="random"`).
+    Fixed components are at the optimum, free ones at normalised 0 (`start="middle"`) or drawn (`start="random"`).
     `reset(options={"volume": name})` chooses the volume. An episode may start on a plane that already scores above
     -success_threshold: it still takes its first step, and `info["starts_solved"]` says so.
 
@@ -62,7 +62,7 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
     | `ends` | terminated |
     | --- | --- |
     | `on_reward` | on the first plane whose reward is above -success_threshold |
-    | `on_budget` | never: the agent may look beside the plane that it wants; only its last plane is judged |
+    | `on_budget` | never: the agent may explore; only its last plane is judged |
     | `on_stop` | on the plane at which the agent says `stop`, rewarded or not |
 
     Every episode is truncated after `max_steps` steps. `is_success` is true for a plane whose reward is above
@@ -81,14 +81,14 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
             of `Observation`. Default: `cluster`.
         flat: Whether the observation is one vector. Default: None, one vector if every part is a vector.
         projection: Free components: `x`, `y`, `xy`, `zy`, `full`, or a list of `rz`, `rx`, `tx`, `ty`. Default: `y`.
-        reward: Object with the methods of `armscan.anatomy.Reward`; one that must be fitted to labelled planes is
-            fitted to those of these volumes. Default: None, the published reward.
+        reward: Object with the methods of `armscan.anatomy.Reward`; one that needs fitting is fitted to the labelled
+            planes of these volumes. Default: None, the published reward.
         targets: Target counts of the published reward: clusters of bones, tendons and artery. Default: (4, 3, 1).
         clustering: Clustering rules: `pixels`, as published; `metric`, for every spacing; or an
             `armscan.anatomy.Tissues`. Default: `pixels`.
         success_threshold: Threshold of success, in (0, 1]: a plane whose reward is above -success_threshold succeeds.
             Default: 0.05.
-        ends: End of an episode before its last step: `on_reward`, `on_budget` (none) or `on_stop`. Default:
+        ends: What ends an episode before `max_steps`: `on_reward`, `on_budget` (nothing) or `on_stop`. Default:
             `on_reward`.
         max_steps: Number of steps after which an episode is truncated, 1 or more. Default: 50.
         start: Plane at the start, `middle` or `random`. Default: `middle`.
@@ -97,7 +97,7 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
         transform: Random motion of the volume at each reset. Default: `RandomTransform()`; None: no motion.
 
     Raises:
-        InvalidValueError: If an argument is outside what is allowed.
+        InvalidValueError: If an argument is invalid.
         OptimalPlaneError: If a volume's labelled plane is missing, outside the bounds, or not above -success_threshold.
         DisplayError: If the mode is `human` and no window can be opened.
     """

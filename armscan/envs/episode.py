@@ -20,8 +20,8 @@ from armscan.volumes.plane import ManipulatorAction
 class Episode:
     """One episode.
 
-    Each plane comes in two steps, so that many environments can be looked at together between them: `aim` at it, then
-    `see` what is there. The first plane is the start, every further one a step.
+    Each plane takes two calls, `aim` and `see`, so that the planes of many environments can be looked at together in
+    between. The first plane is the start; every further one is a step.
 
     Args:
         rules: Rules of the environment.
@@ -79,7 +79,7 @@ class Episode:
         return self.n_steps == 0 or not (self.is_terminated or self.is_truncated)
 
 
-# What `info` holds under each key, and the type of its array, None where it is a string, a number or a truth value.
+# Value of each key of `info`, and the type of its array; None if it is a string, a number or a truth value.
 INFO: dict[str, tuple[Callable[[Episode], Any], type[np.generic] | None]] = {
     "volume": (lambda episode: episode.scene.volume.name, None),
     "rotation_deg": (lambda episode: episode.plane.rotation, np.float64),
@@ -104,7 +104,7 @@ def info_of(episode: Episode) -> dict[str, Any]:
 def begin(rules: Rules, rngs: Sequence[np.random.Generator], volume_names: Sequence[str | None]) -> list[Episode]:
     """Begin an episode for each generator, the source of all its random numbers.
 
-    The episodes have been started but not seen: their first planes are still to be looked at.
+    Their first planes are still to be looked at.
 
     Args:
         rules: Rules of the episodes.
@@ -135,9 +135,9 @@ def look(rules: Rules, episodes: Sequence[Episode]) -> None:
 def check_actions(actions: Any, shape: tuple[int, ...]) -> FloatArray:
     """Return an action, or a batch, of this shape as finite numbers within [-1, 1]; values outside are clipped."""
     try:
-        # A copy: what the caller does with the array afterwards must not change what was done. Text is no number.
+        # A copy, so that later changes to the caller's array have no effect. `same_kind` refuses strings.
         received = np.asarray(actions).astype(np.float64, casting="same_kind")
-        # One by one: a few numbers are compared before NumPy has begun.
+        # In plain Python, which is faster than NumPy for a few numbers.
         if received.shape == shape and all(-1.0 <= number <= 1.0 for number in received.ravel().tolist()):
             return received
     except (TypeError, ValueError):

@@ -47,7 +47,7 @@ class EnvFactory:
         )
 
     def undeformed(self) -> EnvFactory:
-        """Return a factory of environments that move volumes but keep their shape: agents are evaluated in these."""
+        """Return a factory of environments that move volumes without deforming them, as evaluations do."""
         transform = self.rules.get("transform")
         if not isinstance(transform, RandomTransform):
             return self
@@ -60,7 +60,7 @@ class EnvFactory:
     def make_vector_env(
         self, num_envs: int, volumes: Volumes, *, autoreset_mode: str = "NextStep"
     ) -> VectorEnv[Any, Any, Any]:
-        """Make many environments on the same volumes."""
+        """Make a vector environment on these volumes."""
         return make_armscan_vector_env(num_envs, volumes, autoreset_mode=autoreset_mode, **self.rules)
 
 
@@ -87,7 +87,7 @@ def make_armscan_env(
 
 
 def make_armscan_vector_env(num_envs: int = 1, volumes: Volumes = None, **kwargs: Any) -> VectorEnv[Any, Any, Any]:
-    """Make many environments with their wrappers, as `gymnasium.make_vec("armscan/Armscan-v0", ...)` does.
+    """Make a vector environment with its wrappers, as `gymnasium.make_vec("armscan/Armscan-v0", ...)` does.
 
     Args:
         num_envs: Number of environments. Default: 1.
@@ -99,14 +99,14 @@ def make_armscan_vector_env(num_envs: int = 1, volumes: Volumes = None, **kwargs
 
 
 def vectorise(env: Env, num_envs: int) -> VectorEnv[Any, Any, Any]:
-    """Return many environments without autoreset that play by the rules of one, with its wrappers.
+    """Return a vector environment with the rules and wrappers of a single one, without autoreset.
 
     Args:
         env: An `ArmscanEnv` with the wrappers of `make_armscan_env`.
         num_envs: Number of environments.
 
     Raises:
-        InvalidValueError: If it has other wrappers, or is another environment.
+        InvalidValueError: If `env` has other wrappers, or is another environment.
     """
     if isinstance(env, ArmscanEnv):
         return ArmscanVectorEnv.sharing(env.rules, num_envs)
@@ -122,7 +122,7 @@ def vectorise(env: Env, num_envs: int) -> VectorEnv[Any, Any, Any]:
 def _wrapped(
     bare: AnyEnv, stack: int = 1, stack_exclude: Sequence[str] = (), memory: int = 0, stack_memory: bool = False
 ) -> AnyEnv:
-    """Return an environment, or many, with the wrappers that are asked for."""
+    """Return a single or vector environment in the requested wrappers."""
     env: Any = bare
     is_vector = isinstance(env, VectorEnv)
     is_stacked = check_int("stack", stack, at_least=1, at_most=MAX_KEPT) > 1

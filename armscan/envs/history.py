@@ -14,7 +14,7 @@ from armscan.errors import InvalidValueError, listed
 from armscan.utils.validation import check_int
 
 FLAT = ""
-"""The name that a flat observation goes by among parts."""
+"""Name of a flat observation among parts."""
 
 MEMORY = "memory"
 # Observations of a stack, and pairs of a memory.
@@ -24,7 +24,7 @@ EnvIds = NDArray[np.int64]
 
 
 def boxes_of(space: spaces.Space[Any], who: str) -> dict[str, spaces.Box]:
-    """Return the boxes of a vector or `Dict` space by name; the name of a single one is `FLAT`.
+    """Return the boxes of a vector or `Dict` space by name; that of a vector is `FLAT`.
 
     Args:
         space: Observation space.
@@ -48,7 +48,7 @@ def space_of(boxes: Mapping[str, spaces.Box]) -> spaces.Box | MultiBoxSpace:
 
 
 def parts_of(observation: NDArray[Any] | Parts) -> Parts:
-    """Return an observation by name."""
+    """Return the parts of an observation by name."""
     return observation if isinstance(observation, dict) else {FLAT: observation}
 
 
@@ -58,7 +58,7 @@ def observation_of(parts: Parts) -> NDArray[Any] | Parts:
 
 
 def check_exclusions(excluded: Any, boxes: Mapping[str, spaces.Box]) -> frozenset[str]:
-    """Return the names of the parts that are not stacked, each of which must be among those of `boxes`."""
+    """Return the names of the parts excluded from stacking, each of which must be in `boxes`."""
     named = [name for name in boxes if name != FLAT]
     is_collection = isinstance(excluded, list | tuple | set | frozenset)
     if not is_collection or not all(isinstance(name, str) and name in named for name in excluded):
@@ -70,18 +70,18 @@ def check_exclusions(excluded: Any, boxes: Mapping[str, spaces.Box]) -> frozense
 
 
 def rows_of(observations: NDArray[Any] | Parts, rows: int | NDArray[Any]) -> NDArray[Any] | Parts:
-    """Return rows of a batch of observations, by their numbers or as a mask; of a single number the observation."""
+    """Return rows of a batch of observations, by indices or a mask; for a single index, that observation."""
     return observation_of({name: part[rows] for name, part in parts_of(observations).items()})
 
 
 class Remembered(Protocol):
     """History of the episodes of a batch of environments, kept by a wrapper.
 
-    Arguments and results have a row for each of the environments in `env_ids`, an array of their numbers.
+    Arguments and results have a row for each of the environments in `env_ids`, an array of their indices.
     """
 
     boxes: dict[str, spaces.Box]
-    """Space of each part of what one environment observes with it."""
+    """Space of each part of one environment's observation with its history."""
 
     def refill(self, parts: Parts, infos: Mapping[str, Any], env_ids: EnvIds) -> None:
         """Start over with the first observations of some environments."""
@@ -90,7 +90,7 @@ class Remembered(Protocol):
         """Add the latest observation and `info` of environments."""
 
     def added_to(self, parts: Parts, env_ids: EnvIds) -> Parts:
-        """Return the latest observations with the remembered pairs, in arrays that are not filled again."""
+        """Return the latest observations with their history, in arrays that are not reused."""
 
 
 class FrameHistory:
@@ -107,10 +107,10 @@ class FrameHistory:
         self._size = size = check_int("stack", size, at_least=1, at_most=MAX_KEPT)
         excluded = check_exclusions(excluded, boxes)
         stacked = {name: box for name, box in boxes.items() if name not in excluded}
-        # A ring for each environment, because not all of them take every step.
+        # A ring buffer for each environment, because not all of them take every step.
         self._frames = {name: np.empty((n_envs, size, *box.shape), box.dtype) for name, box in stacked.items()}
         self._latest = np.full(n_envs, size - 1)
-        # For each place of the latest one, the places from the oldest, which is overwritten next, to the latest.
+        # For each position of the latest one, the positions from the oldest, which is overwritten next, to the latest.
         self._places = (np.arange(size)[:, None] + np.arange(1, size + 1)) % size
         self.boxes = {**boxes, **{name: self._stacked_box(name, box) for name, box in stacked.items()}}
 
@@ -146,8 +146,8 @@ class FrameHistory:
 class BestPairs:
     """The best (action, reward) pairs of the current episode of each environment of a batch.
 
-    They are ordered from the best to the worst, among equal rewards the earlier first. At first all of them are the
-    first plane's; a new pair enters only if its reward beats the worst one kept.
+    They are ordered from the best to the worst, and with equal rewards from the earliest to the latest. At first all
+    are the first plane's; a new pair enters only if its reward beats the worst one kept.
 
     Args:
         boxes: Space of each part of one environment.
@@ -167,11 +167,11 @@ class BestPairs:
         self.boxes = {FLAT: flat_space({**boxes, MEMORY: box})} if FLAT in boxes else {**boxes, MEMORY: box}
 
     def refill(self, parts: Parts, infos: Mapping[str, Any], env_ids: EnvIds) -> None:
-        """Make all pairs of environments whose episode begins those of its first plane."""
+        """Fill all pairs of environments that begin an episode with the first plane's."""
         self.pairs[env_ids] = self._paired(infos, env_ids)[:, None]
 
     def push(self, parts: Parts, infos: Mapping[str, Any], env_ids: EnvIds) -> None:
-        """Add the latest pair of environments where it is good enough."""
+        """Add the latest pair of each environment in which it beats the worst one kept."""
         latest = self._paired(infos, env_ids)
         enters = (latest[:, -1] > self.pairs[:, -1, -1][env_ids]).nonzero()[0]
         if len(enters):
@@ -181,7 +181,7 @@ class BestPairs:
             self.pairs[where] = np.take_along_axis(self.pairs[where], order[:, :, None], axis=1)
 
     def added_to(self, parts: Parts, env_ids: EnvIds) -> Parts:
-        """Return the latest observations with each environment's pairs in a row, (action, reward) of the best first."""
+        """Return the latest observations with each environment's (action, reward) pairs, flattened, the best first."""
         pairs = self.pairs[env_ids].reshape(len(env_ids), -1)
         return {FLAT: np.concatenate([parts[FLAT], pairs], axis=-1)} if FLAT in parts else {**parts, MEMORY: pairs}
 

@@ -18,18 +18,18 @@ from armscan.volumes import LANDMARK_LABELS
 LONGEST_SIDE_PX = 4096
 # The highest value of a pixel: all of it is of the tissue.
 FULL = 255
-# By which share of a pixel the field of view may differ from a whole number of them.
+# Relative tolerance for the field of view to be a whole number of pixels.
 ROUNDING = 1e-6
-# For each pixel of the slice along an axis, the first pixel of the image that it overlaps, and the share that it fills
-# of that one and of each that follows.
+# For each pixel of the slice along an axis: the first pixel of the image that it overlaps, and the share of this one,
+# and of each that follows, that it covers.
 Overlaps = tuple[NDArray[np.int64], NDArray[np.float32]]
 
 
 class MetricSliceObservation:
-    """Share of bones, tendons and artery in each pixel, in an image about the slice's middle with pixels in mm.
+    """Shares of bones, tendons and artery in each pixel of an image centred on the slice, with pixels sized in mm.
 
-    A pixel is the mean of what the slice shows in its area, from 0 to 255, so that small structures fade, but move
-    smoothly, and volumes of any spacing give the same image. Beside the slice there is nothing: 0.
+    A pixel is the mean of what the slice shows in its area, from 0 to 255, so that small structures fade but move
+    smoothly, and volumes of any spacing give the same image. Outside the slice it is 0.
 
     Args:
         field_of_view_mm: Size (across, depth) of the image in mm, each above 0.
@@ -81,7 +81,7 @@ class MetricSliceObservation:
 
 
 def _overlaps(n: int, size_mm: float, m: int, pixel_mm: float) -> Overlaps:
-    """Return the overlaps of n pixels of the slice with m pixels of the image along an axis, their middles in place."""
+    """Return the overlaps of n pixels of the slice with m pixels of the image, centred on each other, along an axis."""
     edges = ((np.arange(n + 1) - n / 2) * size_mm) / pixel_mm + m / 2
     first = np.clip(np.floor(edges[:-1]), 0, m).astype(np.int64)
     last = np.clip(np.ceil(edges[1:]), 0, m).astype(np.int64)
@@ -92,7 +92,7 @@ def _overlaps(n: int, size_mm: float, m: int, pixel_mm: float) -> Overlaps:
 
 @cached_njit(nogil=True, error_model="numpy")
 def _pool(slice_xz: NDArray[np.uint8], across: Overlaps, depth: Overlaps, image: NDArray[np.uint8]) -> None:
-    """Fill an image with the share of each pixel that bones, tendons and artery, labels 1 to 3, take."""
+    """Fill an image with the share of each pixel that bones, tendons and artery, labels 1 to 3, cover."""
     (first_row, row_shares), (first_col, col_shares) = across, depth
     n_tissues, n_rows, n_cols = image.shape
     shares = np.zeros((n_rows, n_tissues, n_cols), dtype=np.float32)

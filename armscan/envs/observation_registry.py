@@ -20,7 +20,7 @@ from armscan.envs.slice_observations import SliceChannelsObservation, SliceObser
 from armscan.envs.spaces import Parts
 from armscan.errors import InvalidValueError, listed
 
-# As users give one: an object, a name, or a list of those that are merged.
+# An observation as users give it: an object, a name, or a list of these to merge.
 ObservationLike = str | Observation | Sequence["ObservationLike"]
 
 
@@ -32,7 +32,7 @@ class MergedObservation:
         targets: Numbers that `cluster`, given by name, divides its counts by. Default: (4, 3, 1).
 
     Raises:
-        InvalidValueError: If there is none, or one is no observation.
+        InvalidValueError: If there are none, or one is not an observation.
     """
 
     def __init__(self, observations: Sequence[ObservationLike], *, targets: Sequence[int] = PUBLISHED_TARGETS) -> None:
@@ -78,7 +78,7 @@ NAMED_OBSERVATIONS: dict[str, type[Observation]] = {
 
 
 def with_action_reward(observation: ObservationLike, targets: Sequence[int] = PUBLISHED_TARGETS) -> Observation:
-    """Return an observation with action and reward, which are part of every one; `targets` are for `cluster`."""
+    """Return an observation with action and reward, added if it lacks them; `targets` are for `cluster`."""
     merged = MergedObservation([observation], targets=targets)
     if any(isinstance(member, ActionRewardObservation) for member in merged.observations):
         return merged

@@ -17,7 +17,7 @@ from armscan.utils.arrays import FloatArray
 from armscan.utils.compilation import cached_njit
 from armscan.utils.validation import check_bool
 
-# Of bones, tendons and artery, at the usual pixel size.
+# Typical areas of bones, tendons and artery at the usual pixel size.
 USUAL_AREAS_PX = (3000.0, 1000.0, 100.0)
 CENTRE_SCALE_MM = (25.0, 12.0)
 
@@ -58,7 +58,7 @@ class View:
 
     @cached_property
     def clusters(self) -> TissueClusters:
-        """The clusters themselves, found again when they are asked for."""
+        """The clusters themselves, computed on first access."""
         return TissueClusters.from_slice(self.slice_xz, self.tissues, self.geometry.pixel_mm)
 
 
@@ -69,15 +69,15 @@ class Observation(Protocol):
         """Return the space of each part, for every geometry that can occur and `n_free` action components."""
 
     def observe(self, view: View) -> Parts:
-        """Return the value of each part, within its space, in arrays that are not filled again."""
+        """Return the value of each part, within its space, in arrays that are not reused."""
 
 
 def observe_all(observation: Observation, views: Sequence[View]) -> Parts:
     """Return the parts of an observation for many views at once, shape (n_views, ...).
 
-    An observation of one's own is asked view by view, unless it has a method `observe_all(views)` too.
+    A custom observation without a method `observe_all(views)` is called view by view.
     """
-    # Not by a protocol: to compare with one takes longer than to observe.
+    # Not by `isinstance` with a protocol, which takes longer than observing.
     if (observe_them := getattr(observation, "observe_all", None)) is not None:
         parts: Parts = observe_them(views)
         return parts
@@ -110,9 +110,10 @@ class ActionRewardObservation:
 class ClusterObservation:
     """For each tissue (bones, tendons, artery): clusters, clustered pixels, mean of the centres; shape (12,).
 
-    Normalised, the counts are over their targets, the pixels over the tissue's usual area, and the centre is in mm
-    from the slice's middle over (25, 12) mm, 0 if the tissue is absent: all near [-1, 1]. Raw, they are the plain
-    numbers, the centre in pixels. Agents learn in a minute with the normalised form what they never learn with the raw.
+    In the normalised form, counts are divided by their targets, pixels by the tissue's typical area, and the centre's
+    offset from the slice's middle by (25, 12) mm; all are 0 if the tissue is absent, and near [-1, 1] otherwise. The
+    raw form has the plain numbers, the centre in pixels. Agents learn in a minute with the normalised form what they
+    never learn with the raw one.
 
     Args:
         normalised: Whether to return the normalised form; False: the raw one. Default: True.
@@ -147,7 +148,7 @@ class ClusterObservation:
         return {"clusters": np.array(features)}
 
     def _features(self, landmarks: FloatArray, geometry: SliceGeometry) -> NDArray[np.float32]:
-        """Turn summaries of clusters, shape (n, 3, 4), into the wanted form, shape (n, 12)."""
+        """Return the features, shape (n, 12), of summaries of clusters, shape (n, 3, 4), in the chosen form."""
         if not self.normalised:
             return landmarks.reshape(len(landmarks), -1).astype(np.float32)
         if geometry not in self._scales:
@@ -180,6 +181,6 @@ def _normalise(landmarks: FloatArray, zero: FloatArray, scale: FloatArray, featu
 def _most_landmarks(geometry: SliceGeometry) -> Landmarks:
     """Return the largest summary that a slice could have, shape (3, 4)."""
     n_across, n_depth = geometry.shape
-    # At least 1, so that a slice of one pixel's thickness has a space that is not a single point.
+    # At least 1, so that the space of a slice one pixel thick is not a single point.
     most = [n_across * n_depth, n_across * n_depth, max(1, n_across - 1), max(1, n_depth - 1)]
     return np.array([most] * len(USUAL_AREAS_PX), dtype=float)

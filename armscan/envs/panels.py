@@ -27,7 +27,7 @@ OPTIMUM_INK = (96, 222, 255)
 REWARD_INK = (255, 150, 80)
 # Background, bones, tendons, artery, nerve.
 TISSUE_INKS = np.array([(34, 38, 48), (224, 214, 190), (72, 178, 118), (226, 74, 70), (168, 138, 220)], dtype=np.uint8)
-# Clusters 1, 2, 3, 4 of a tissue, and so on from the first again: each its own shade of the tissue's colour.
+# Shades of the tissue's colour for clusters 1, 2, 3, 4, repeated for further ones.
 SHADES = (1.0, 0.84, 0.92, 0.76)
 UNCLUSTERED = 0.45
 OUTLINE_INK = (255, 255, 255)
@@ -39,13 +39,13 @@ Inks = NDArray[np.uint8]
 Pixel = TypeVar("Pixel", bound=np.generic)
 Ink = tuple[int, int, int]
 Size = tuple[int, int]
-# From the palm, (along, across, 3), and the side, (along, depth, 3): drawn once a volume, and forgotten with it.
+# Views from the palm, (along, across, 3), and the side, (along, depth, 3): drawn once per volume, and freed with it.
 _SIDES: WeakKeyDictionary[LabelVolume, tuple[Inks, Inks]] = WeakKeyDictionary()
 
 
 @lru_cache
 def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    """Return the font of every text, loaded once a size."""
+    """Return the font of all text, loaded once per size."""
     return ImageFont.load_default(size)
 
 
@@ -56,9 +56,9 @@ def slice_panel(view: View, room: Size) -> Image.Image:
 
     Args:
         view: Slice to draw, with its clusters.
-        room: Size (width, height) in pixels that the picture fits into; its proportions stay.
+        room: Size (width, height) in pixels that the picture fits into; its aspect ratio is kept.
     """
-    # Of each pixel the number of its cluster, 0 where it has none; no pixel is of two tissues.
+    # Cluster number of each pixel, 0 if it has none; no pixel is of two tissues.
     numbers = np.sum([tissue.image for tissue in view.clusters.each()], axis=0)
     (n_across, n_depth), (across_mm, depth_mm) = view.geometry.shape, view.geometry.pixel_mm
     size_mm = n_across * across_mm, n_depth * depth_mm
@@ -88,7 +88,7 @@ def _slice_inks(view: View, numbers: NDArray[np.int32]) -> Inks:
 
 
 def _outlines(codes: NDArray[np.int32]) -> NDArray[np.bool_]:
-    """Return the outlines of clusters: pixels with a code that is not 0, beside a pixel with another code."""
+    """Return the outlines of clusters: pixels with a nonzero code next to a pixel with another code."""
     framed = np.pad(codes, 1)
     middle = framed[1:-1, 1:-1]
     beside = (framed[:-2, 1:-1], framed[2:, 1:-1], framed[1:-1, :-2], framed[1:-1, 2:])
@@ -102,14 +102,14 @@ def side_panels(
     planes: Sequence[tuple[ManipulatorAction, Ink, int]],
     rooms: tuple[Size, Size],
 ) -> tuple[Image.Image, Image.Image]:
-    """Draw the volume as it was read from the palm (frontal) and from the side (sagittal), fingers up, in one scale.
+    """Draw the unmoved volume from the palm (frontal) and from the side (sagittal), fingers up, at one scale.
 
     Args:
         volume: Volume to draw.
-        transform: Motion of the volume in the episode; None for none.
+        transform: Motion of the volume in the episode. None: no motion.
         planes: Planes to outline, in the frame of the moved volume, each with its colour and its line width in pixels;
             the last one is on top.
-        rooms: Size (width, height) in pixels that either picture fits into; its proportions stay.
+        rooms: Size (width, height) in pixels that each picture fits into; its aspect ratio is kept.
     """
     if volume not in _SIDES:
         from_palm, from_side = _first_seen(volume.labels[:, :, ::-1], 2), _first_seen(volume.labels, 0)
@@ -137,7 +137,7 @@ def _first_seen(labels_xyz: NDArray[np.uint8], axis: int) -> NDArray[np.uint8]:
 
 
 def _corners_mm(volume: LabelVolume, transform: RigidTransform | None, action: ManipulatorAction) -> FloatArray:
-    """Return the four corners of a slice where they lie in the volume as it was read, shape (4, 3)."""
+    """Return the four corners of a slice in the unmoved volume, in mm, shape (4, 3)."""
     matrix, offset_mm = (transform or RigidTransform()).plane_map(action)
     across_mm, _, depth_mm = volume.size_mm
     corners = np.array([[0, 0, 0], [across_mm, 0, 0], [across_mm, 0, depth_mm], [0, 0, depth_mm]])
@@ -148,8 +148,8 @@ def reward_panel(rewards: Sequence[float], places: range, threshold: float, size
     """Draw rewards from left to right between 0, at the top, and -1.
 
     Args:
-        rewards: Reward of each place from the first, each in [-1, 0], one or more.
-        places: Numbers of the places to draw.
+        rewards: Rewards, each in [-1, 0], one or more; they begin at the first of `places`.
+        places: Numbers along the horizontal axis.
         threshold: Reward to draw as a line across.
         size: Size (width, height) in pixels.
     """
@@ -176,7 +176,7 @@ def reward_panel(rewards: Sequence[float], places: range, threshold: float, size
 
 
 def _scale(size_mm: tuple[float, float], room: Size) -> float:
-    """Return the pixels a mm of the largest picture that fits into a room."""
+    """Return the pixels per mm of the largest picture that fits into a room."""
     return min(room[0] / size_mm[0], room[1] / size_mm[1])
 
 

@@ -1,4 +1,4 @@
-"""Pictures of a plane, in an episode or outside of one: its slice, its place, its reward."""
+"""Pictures of a plane, in an episode or outside one: its slice, its position, its reward."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class ReferencePlane(NamedTuple):
 
 
 class History(NamedTuple):
-    """The rewards that led here, each in [-1, 0], the numbers of all places for them, the goal, and a title."""
+    """Rewards up to the current plane, each in [-1, 0], the numbers on the horizontal axis, the goal, and a title."""
 
     rewards: Sequence[float]
     places: range
@@ -58,7 +58,7 @@ class History(NamedTuple):
 
 
 def draw_frame(episode: Episode) -> NDArray[np.uint8]:
-    """Draw an episode, whose first plane has been looked at, as it stands: shape (512, 860, 3)."""
+    """Draw the current state of an episode, whose first plane has been looked at, shape (512, 860, 3)."""
     scene, rules = episode.scene, episode.rules
     return draw_plane(
         scene.volume,
@@ -87,9 +87,9 @@ def draw_plane(
         volume: Volume that the plane lies in.
         plane: Plane to draw, in the frame of the moved volume.
         view: Slice at the plane, with its clusters.
-        transform: Motion of the volume, None for none.
+        transform: Motion of the volume. None: no motion.
         beside: Another plane to draw, and to measure the distance from.
-        history: Rewards of the planes before.
+        history: Rewards up to this plane. None: not drawn.
         caption: Text before the reward.
 
     Returns:
@@ -123,10 +123,10 @@ def view_of(
     tissues: Tissues = PIXEL_TISSUES,
     reward: Reward = LandmarkReward(),  # noqa: B008 - it is not changed
 ) -> View:
-    """Look at a plane outside of an episode, in a volume as it was read.
+    """Look at a plane of an unmoved volume, outside an episode.
 
     Returns:
-        View of the plane; no action led there, so its `action` is empty.
+        View of the plane; its `action` is empty.
     """
     slice_xz, landmarks = Scanner([volume], tissues).look(0, plane)
     return View(
@@ -177,7 +177,7 @@ def _write_facts(
 
 
 def _shortened(line: str) -> str:
-    """Return a line that fits beside the rewards: the middle of a long file name is left out."""
+    """Return a line shortened in its middle, as a long file name may need, to fit beside the rewards."""
     n_kept = len(line)
     shortened = line
     while font(15).getlength(shortened) > FACTS_WIDTH:

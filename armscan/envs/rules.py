@@ -41,7 +41,7 @@ Observed = NDArray[Any] | Parts
 
 
 class Rules:
-    """The rules that one environment or many play by; see `ArmscanEnv` for its arguments."""
+    """Rules of a single or vector environment; see `ArmscanEnv` for the arguments."""
 
     def __init__(
         self,
@@ -99,7 +99,7 @@ class Rules:
         )
 
     def look(self, scenes: Sequence[Scene], actions: Sequence[ManipulatorAction]) -> list[View]:
-        """Look at planes, one in each scene; many are looked at together, on all cores.
+        """Look at one plane in each scene; several are looked at together, on all cores.
 
         The views' `action` is left empty.
         """
@@ -113,12 +113,12 @@ class Rules:
         return [self._view(*seen) for seen in zip(scenes, slices, landmarks, strict=True)]
 
     def look_at(self, scene: Scene, action: ManipulatorAction) -> View:
-        """Look at one plane; as `look`."""
+        """Look at one plane, as `look` does."""
         return self._view(scene, *self._scanner.look(self._place[scene.volume.name], action, scene.maps))
 
     @property
     def transform(self) -> RandomTransform | None:
-        """The motions of the volume at reset; None for none."""
+        """The random motion of the volume at reset; None: no motion."""
         return self._sampler.transform
 
     @property
@@ -129,7 +129,7 @@ class Rules:
     def draw_scenes(
         self, names: Sequence[str], rngs: Sequence[np.random.Generator]
     ) -> list[tuple[Scene, NDArray[np.uint8]]]:
-        """Draw a scene of each named volume whose labelled plane is rewarded above -success_threshold.
+        """Draw a scene of each named volume in which the optimal plane's reward is above -success_threshold.
 
         Args:
             names: Names of the volumes.
@@ -139,7 +139,8 @@ class Rules:
             Each scene, and the slice of its optimal plane.
 
         Raises:
-            OptimalPlaneError: If none of a thousand motions keeps the labelled plane within the bounds and rewarded.
+            OptimalPlaneError: If none of a thousand motions keeps the optimal plane within the bounds and its reward
+                above -success_threshold.
         """
         drawn: dict[int, tuple[Scene, NDArray[np.uint8]]] = {}
         for _ in range(MAX_DRAWS):
@@ -162,7 +163,7 @@ class Rules:
         )
 
     def _look_at_optima(self, scenes: Sequence[Scene]) -> list[View]:
-        """Look at the optimal plane of each scene; where it shows the labelled slice, that is not looked up again."""
+        """Look at the optimal plane of each scene; the slice is not looked up again where it is the labelled one."""
         views = {i: self._labelled_view(scene.volume) for i, scene in enumerate(scenes) if shows_labelled(scene)}
         others = [i for i in range(len(scenes)) if i not in views]
         if others:
@@ -171,7 +172,7 @@ class Rules:
         return [views[i] for i in range(len(scenes))]
 
     def _labelled_view(self, volume: LabelVolume) -> View:
-        """Return the view of the labelled plane of a volume as it was read."""
+        """Return the view of the labelled plane in the unmoved volume."""
         if volume.name not in self._labelled_views:
             plane = volume.optimal_action
             assert plane is not None
@@ -227,7 +228,7 @@ class Rules:
 
 
 def named_volumes(volumes: Volumes) -> dict[str, LabelVolume]:
-    """Return volumes given in any of the ways that `ArmscanEnv` takes, by name."""
+    """Return volumes by name, given in any form that `ArmscanEnv` accepts."""
     if volumes is None:
         return load_phantoms(DEFAULT_PHANTOMS)
     if isinstance(volumes, str | Path):

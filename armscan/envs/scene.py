@@ -18,30 +18,31 @@ from armscan.volumes.volume import LabelVolume
 
 MAX_SHIFT_MM = 10_000.0
 CENTRES = ("middle", "first_voxel")
-# Of scale, stretch and shear: with less, no draw can come near to a flat volume.
+# Limit of scale, stretch and shear, within which no draw comes near a flat volume.
 MAX_DEFORMATION = 0.3
-# What a shear moves, and along which axis it grows: nothing along the normal, or the labelled plane would move.
+# The axis that each shear shifts, and the one along which it grows: none shifts along the normal, which would move the
+# labelled plane.
 SHEARED = ((0, 2), (2, 0), (0, 1), (2, 1))
 
 
 @dataclass(frozen=True, kw_only=True)
 class RandomTransform:
-    """The motions and deformations of a volume at reset, each component drawn uniformly.
+    """Random motion and deformation of a volume at reset, each component drawn uniformly.
 
-    The deformations make other wrists of one: they are about the middle of the labelled slice, keep the labelled plane
-    where it is, and cost nothing, because a slice is looked up through them. Pixels stay as large as they are, so that
-    the landmarks of a larger wrist are larger, in pixels as in mm.
+    Deformations make other wrists of one: they are centred on the labelled slice, keep the labelled plane fixed, and
+    cost nothing, because the lookup of a slice applies them. The pixel size does not change, so that a larger wrist has
+    larger landmarks, in pixels as in mm.
 
     Args:
         rz_deg: Largest rotation about Z, in degrees, in both directions, from 0 to 180.
         rx_deg: Largest rotation about X, in degrees, in both directions, from 0 to 180.
-        tx_mm: Largest translation along X, in mm, in both directions, 0 or more.
-        ty_mm: Largest translation along Y, in mm, in both directions, 0 or more.
+        tx_mm: Largest translation along X, in mm, in both directions, from 0 to 10,000.
+        ty_mm: Largest translation along Y, in mm, in both directions, from 0 to 10,000.
         centre: Fixed point of the rotation: `middle` of the volume, or `first_voxel`, as published, which moves the
             hand out of the picture.
-        scale: Largest change of the volume's size in all directions alike, as a share of it, from 0 to 0.3.
-        stretch: Largest change of its size across, along the labelled normal and in depth, each drawn separately, as a
-            share of it, from 0 to 0.3.
+        scale: Largest relative change of the volume's size, the same in all directions, from 0 to 0.3.
+        stretch: Largest relative change of its size across, along the labelled normal and in depth, each drawn
+            separately, from 0 to 0.3.
         shear: Largest shear, in mm of shift per mm along another axis, from 0 to 0.3: across and depth shift with the
             position along the labelled normal, and with each other.
         mirror: Whether to mirror an episode's volume, so that it shows the other hand, with probability 0.5.
@@ -69,13 +70,13 @@ class RandomTransform:
 
     @property
     def rigid(self) -> RandomTransform:
-        """The motions alone."""
+        """The same motion without deformation."""
         return replace(self, scale=0.0, stretch=0.0, shear=0.0, mirror=False)
 
     def draw(self, volume: LabelVolume, rng: np.random.Generator) -> RigidTransform:
         """Draw one motion of a volume, and its deformation if there is one."""
         limits = self.rz_deg, self.rx_deg, self.tx_mm, self.ty_mm
-        # What `rng.uniform` draws between arrays of limits, in a fraction of its time, as plain numbers.
+        # The numbers that `rng.uniform` draws with arrays of limits, in a fraction of its time, as plain floats.
         drawn = rng.random(4).tolist()
         rz, rx, tx, ty = (-limit + 2.0 * limit * part for limit, part in zip(limits, drawn, strict=True))
         centre_mm = volume.centre_mm if self.centre == "middle" else (0.0, 0.0, 0.0)
@@ -104,7 +105,7 @@ class RandomTransform:
 
 @dataclass(frozen=True)
 class Scene:
-    """A volume as it lies in one episode.
+    """A volume as it is moved in one episode.
 
     Args:
         volume: Volume of the episode.
@@ -125,11 +126,11 @@ class Scene:
 
     @property
     def maps(self) -> FloatArray:
-        """The affine maps that take a point into the volume as it was read; see `RigidTransform.maps`."""
+        """The affine maps that take a point into the unmoved volume; see `RigidTransform.maps`."""
         return NO_MAPS if self.transform is None else self.transform.maps
 
     def plane_map(self, action: ManipulatorAction) -> tuple[FloatArray, FloatArray]:
-        """Return (M, b): a point p of the plane's frame lies at M p + b in the volume as it was read."""
+        """Return (M, b): a point p of the plane's frame lies at M p + b in the unmoved volume."""
         return mapped_plane(self.maps, action.rotation, action.translation)
 
     def distance(self, action: ManipulatorAction) -> tuple[float, float]:
@@ -156,11 +157,11 @@ class SceneSampler:
         return _bounds(self.rotation_bounds_deg, self.translation_bounds_mm or (size_mm[0], size_mm[1]))
 
     def unmoved(self, volume: LabelVolume) -> Scene:
-        """Return the scene of a volume as it is.
+        """Return the scene of an unmoved volume.
 
         Raises:
             OptimalPlaneError: If scenes of this volume cannot be drawn, because it has no labelled plane, or the plane
-                can leave the bounds of the rotations, or it misses the volume.
+                can be turned out of the rotation bounds, or misses the volume.
         """
         if volume.optimal_action is None:
             raise OptimalPlaneError(
@@ -200,10 +201,10 @@ class SceneSampler:
 
 
 def shows_labelled(scene: Scene) -> bool:
-    """Return whether the optimal plane of a scene shows the slice of the labelled plane, to the last voxel.
+    """Return whether the optimal plane of a scene shows exactly the slice of the labelled plane.
 
-    It does unless the picture was shifted into the bounds, or turned within the plane by a motion about X, or the
-    volume was deformed; and but for rounding, which `labelled_clearance` leaves room for.
+    It does, up to rounding, for which `labelled_clearance` leaves room, unless the slice was shifted into the bounds or
+    turned within the plane by a motion about X, or the volume was deformed.
     """
     labelled = scene.volume.optimal_action
     assert labelled is not None

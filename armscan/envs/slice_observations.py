@@ -18,7 +18,7 @@ from armscan.volumes import LABEL_NAMES, LANDMARK_LABELS
 
 Shape = tuple[int, int]
 LONGEST_SIDE_PX = 4096
-# Which label a reduced pixel shows when several meet in it: the one that is rarer, and so would get lost, first.
+# Priority of the labels that meet in a reduced pixel: the rarer one, which would get lost otherwise, wins.
 RANKS = np.array([0, 1, 2, 4, 3], dtype=np.uint8)
 LABEL_OF_RANK = np.argsort(RANKS).astype(np.uint8)
 
@@ -26,9 +26,9 @@ LABEL_OF_RANK = np.argsort(RANKS).astype(np.uint8)
 class _FramedSlice:
     """Brings slices of different volumes to one shape.
 
-    A slice is cropped about its middle to `crop`; for an odd surplus the larger half goes from the low side. Then,
-    where `shape` is given, it is reduced (or repeated) to that shape: pixel i of m stands for the pixels from i n / m
-    to (i + 1) n / m of the n there were, and shows the highest value among them, so that thin structures stay visible.
+    A slice is cropped to `crop` about its middle; of an odd surplus the larger half is cut from the low side. Then, if
+    `shape` is given, it is reduced (or enlarged) to that shape: pixel i of m covers pixels i n / m to (i + 1) n / m of
+    the original n, and shows the highest value among them, so that thin structures stay visible.
     """
 
     def __init__(self, *, crop: Sequence[int] | None = None, shape: Sequence[int] | None = None) -> None:
@@ -53,7 +53,7 @@ class _FramedSlice:
 
 @cached_njit(nogil=True)
 def _reduce(image: NDArray[np.uint8], reduced: NDArray[np.uint8]) -> None:
-    """Fill each pixel with the highest value of the pixels that it stands for."""
+    """Fill each pixel with the highest value of the pixels that it covers."""
     (n_rows, n_cols), (m_rows, m_cols) = image.shape, reduced.shape
     for i in range(m_rows):
         for k in range(m_cols):
@@ -67,7 +67,7 @@ def _reduce(image: NDArray[np.uint8], reduced: NDArray[np.uint8]) -> None:
 class SliceObservation(_FramedSlice):
     """The slice as one image of labels, uint8: 0 background, 1 bones, 2 tendons, 3 artery, 4 nerve.
 
-    Reduced, a pixel shows the rarest tissue of those that meet in it: artery, nerve, tendons, bones, in this order.
+    A reduced pixel shows the rarest tissue of those that meet in it: artery, nerve, tendons, bones, in this order.
 
     Args:
         crop: Size (across, depth) in pixels of the middle part to keep, each from 1 to 4096. Default: None, the
@@ -95,7 +95,7 @@ class SliceObservation(_FramedSlice):
 class SliceChannelsObservation(_FramedSlice):
     """The slice as one channel for each of bones, tendons and artery, uint8: 1 where that tissue is, 0 elsewhere.
 
-    Reduced, a pixel is 1 where any of the pixels it stands for is.
+    A reduced pixel is 1 if any of the pixels that it covers is.
 
     Args:
         crop: Size (across, depth) in pixels of the middle part to keep, each from 1 to 4096. Default: None, the

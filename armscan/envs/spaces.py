@@ -16,13 +16,13 @@ Parts = dict[str, NDArray[Any]]
 
 
 class MultiBoxSpace(spaces.Dict):
-    """A `Dict` space every value of which is a `Box`.
+    """A `Dict` space that holds only `Box` spaces.
 
     Args:
         boxes: Boxes by the name of their part.
 
     Raises:
-        InvalidValueError: If there is none, or a value is no `Box`.
+        InvalidValueError: If there are none, or a value is not a `Box`.
     """
 
     def __init__(self, boxes: Mapping[str, spaces.Box]) -> None:
@@ -45,7 +45,7 @@ class MultiBoxSpace(spaces.Dict):
 
 
 def in_order(parts: Parts, shapes: Mapping[str, tuple[int, ...]], leading: tuple[int, ...] = ()) -> Parts:
-    """Return the parts of an observation in the order of their boxes' shapes, each of shape (*leading, *shape)."""
+    """Return the parts of an observation in the order of `shapes`, each checked to have shape (*leading, *shape)."""
     if parts.keys() != shapes.keys():
         raise InvalidValueError(
             f"the observation gave the parts {', '.join(parts)}, but its spaces are of {', '.join(shapes)}"
@@ -61,13 +61,13 @@ def in_order(parts: Parts, shapes: Mapping[str, tuple[int, ...]], leading: tuple
 
 
 def flat_space(boxes: Mapping[str, spaces.Box]) -> spaces.Box:
-    """Return the space of parts as `flatten` returns them, their bounds in the order of the data."""
+    """Return the space of what `flatten` returns: the bounds of all parts, in their order."""
     low = np.concatenate([box.low.ravel() for box in boxes.values()])
     high = np.concatenate([box.high.ravel() for box in boxes.values()])
     return spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
 
 
 def flatten(parts: Parts) -> NDArray[np.float32]:
-    """Return the parts, each shape (..., n), as one of 32-bit floats, side by side in their order."""
-    # Of 32-bit floats already, unless an image is among them.
+    """Concatenate parts, each of shape (..., n), in their order, as 32-bit floats."""
+    # 32-bit floats already, unless an image is among them.
     return np.concatenate(list(parts.values()), axis=-1).astype(np.float32, copy=False)

@@ -1,4 +1,4 @@
-"""Many environments as one: their planes are looked at together, on all cores, without subprocesses."""
+"""The vector environment: planes are looked at together, on all cores, without subprocesses."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ VectorStep = tuple[Observed, FloatArray, Mask, Mask, dict[str, Any]]
 
 
 class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
-    """`num_envs` environments on the same volumes, each with a random generator of its own.
+    """`num_envs` environments on the same volumes, each with its own random generator.
 
-    Environment i gives bit for bit what an `ArmscanEnv` with the same seed gives. In the autoreset mode `NextStep` the
-    step after an episode's end resets that environment, its action ignored and its reward 0, as Gymnasium defines it;
-    with `Disabled` the caller resets the ended ones by `reset(options={"reset_mask": mask})`.
+    Environment i is bit-identical to an `ArmscanEnv` with the same seed. In autoreset mode `NextStep` the step after an
+    episode's end resets that environment, ignoring the action, with reward 0, as Gymnasium defines it; in `Disabled`
+    the caller resets finished ones by `reset(options={"reset_mask": mask})`.
 
     Args:
         num_envs: Number of environments, 1 or more.
@@ -40,7 +40,7 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
             the wrappers require `action` and `reward`.
 
     Raises:
-        InvalidValueError: If an argument is outside what is allowed.
+        InvalidValueError: If an argument is invalid.
     """
 
     metadata: dict[str, Any]
@@ -60,7 +60,7 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
 
     @classmethod
     def sharing(cls, rules: Rules, num_envs: int) -> Self:
-        """Return environments that play by the rules of others, without autoreset; their volumes are held once."""
+        """Return a vector environment that shares another's rules and volumes, without autoreset."""
         envs = cls.__new__(cls)
         envs._set_up(num_envs, AutoresetMode.DISABLED, lambda: rules)
         return envs
@@ -84,8 +84,8 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
         """Start an episode in each environment, or in those that `options["reset_mask"]` marks.
 
         Args:
-            seed: Seed of the first environment; the next has the next seed. Or a seed for each; None keeps a generator
-                as it is.
+            seed: Seed of the first environment, counted up for the others, or a list with one for each. Default: None,
+                the random generators go on.
             options: `volume`: name of a volume for all, or a list with one for each; `reset_mask`: environments to
                 reset, booleans of shape (num_envs,).
 
@@ -109,7 +109,7 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
 
         Args:
             actions: Actions, a row for each environment that takes a step.
-            env_ids: Numbers of these environments, each at most once; results have a row for each of them, in this
+            env_ids: Indices of these environments, each at most once; results have a row for each of them, in this
                 order, and other environments do not change. Default: None, all environments.
         """
         chosen = np.arange(self.num_envs) if env_ids is None else self._checked_ids(env_ids)
@@ -133,7 +133,7 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
         return self._observed(episodes), rewards, terminated, truncated, infos
 
     def episodes(self, env_ids: Sequence[int] | EnvIds) -> list[Episode]:
-        """Return the current episodes of some environments, which, like `optimal_actions`, no agent may see."""
+        """Return the current episodes of some environments: privileged, like `optimal_actions`."""
         return [self._episode(int(i)) for i in env_ids]
 
     @property
@@ -168,13 +168,13 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
         return self.rules.observe_all([episode.view for episode in episodes])
 
     def _infos(self, episodes: Sequence[Episode], is_given: Mask) -> dict[str, Any]:
-        """Return `info` as arrays, and under `_key` which environments it is given for, as Gymnasium has it."""
+        """Return `info` as arrays, with a mask `_key` for each of the environments that have it, as in Gymnasium."""
         given = [episode for episode, is_its in zip(episodes, is_given, strict=True) if is_its]
         infos: dict[str, Any] = {}
         for key in self.info_keys:
             of, dtype = INFO[key]
             values = np.array([of(episode) for episode in given], dtype=dtype)
-            # Of texts Gymnasium makes arrays of objects.
+            # Gymnasium keeps strings in arrays of objects.
             infos[key] = values = values.astype(object) if values.dtype.kind == "U" else values
             if len(given) < len(episodes):
                 infos[key] = np.zeros((len(episodes), *values.shape[1:]), dtype=values.dtype)
@@ -183,7 +183,7 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
         return infos
 
     def _volume_names(self, options: Any) -> list[str | None]:
-        """Return the name of the volume that options choose for each environment, None for one that is drawn."""
+        """Return the name of the volume that options choose for each environment; None: drawn at random."""
         listed_names = options.get("volume") if isinstance(options, dict) else None
         if not isinstance(listed_names, list | tuple):
             return [wanted_volume(self.rules, options)] * self.num_envs
@@ -235,15 +235,15 @@ def reset_each(
     seeds: int | Sequence[int | None] | None = None,
     options: dict[str, Any] | None = None,
 ) -> tuple[Observed, dict[str, Any]]:
-    """Reset vector environments, with a seed for each if there is a list of them."""
-    # Gymnasium's types leave out such lists, which its own vector environments take.
+    """Reset a vector environment; `seeds` may be a list with one for each environment."""
+    # Gymnasium's vector environments accept such lists, although its types do not.
     return envs.reset(seed=seeds, options=options)  # type: ignore[arg-type]
 
 
 def step_each(
     envs: VectorEnv[Any, Any, Any], actions: Any, env_ids: Sequence[int] | EnvIds | None = None
 ) -> VectorStep:
-    """Take a step in vector environments, or in those of `env_ids` (only armscan's); see `ArmscanVectorEnv`."""
+    """Take a step in a vector environment, or, if it is armscan's, in its `env_ids`; see `ArmscanVectorEnv.step`."""
     stepped: VectorStep = envs.step(actions) if env_ids is None else cast(Any, envs).step(actions, env_ids)
     return stepped
 

@@ -1,4 +1,4 @@
-"""A window that shows pictures as they come; Matplotlib's, which also has the sliders of `armscan data explore`."""
+"""A window of Matplotlib that shows pictures as they come; `armscan data explore` adds sliders to one."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ if TYPE_CHECKING:
     from matplotlib.image import AxesImage
 
 DPI = 100
-# Of the backends that draw into files or a notebook's page, and so neither move nor can be clicked.
+# Backends that draw into files or static notebook output, without animation or mouse events.
 STILL_BACKENDS = ("agg", "cairo", "inline", "pdf", "pgf", "ps", "svg", "template")
 
 
 class Window:
-    """Shows pictures, each until the next one comes; opened by the first.
+    """Shows pictures, each until the next one comes; the first one opens the window.
 
-    A window that a person closes stays closed, until `close` has been called and another picture comes.
+    A window that a person closes stays closed until `close` has been called and another picture comes.
 
     Raises:
         DisplayError: If no window can be shown here.
@@ -38,7 +38,7 @@ class Window:
         self._shown_s = 0.0
 
     def show(self, picture: NDArray[np.uint8]) -> None:
-        """Show a picture, shape (height, width, 3), not before the last one has been seen long enough."""
+        """Show a picture, shape (height, width, 3), once the last one has been shown for long enough."""
         if self._figure is None or self._image is None:
             self._figure, self._image = opened(self.title, picture)
             self._figure.canvas.mpl_connect("close_event", self._was_closed)
@@ -55,7 +55,7 @@ class Window:
             self._shown_s = time.monotonic()
 
     def close(self) -> None:
-        """Close the window; nothing happens if none is open."""
+        """Close the window if it is open."""
         if self._figure is not None:
             from matplotlib import pyplot
 
@@ -68,7 +68,7 @@ class Window:
 
 
 def opened(title: str, picture: NDArray[np.uint8], height_below: int = 0) -> tuple[Figure, AxesImage]:
-    """Make a figure, not shown yet, that a picture fills in its own pixels.
+    """Make a figure, not shown yet, that shows a picture pixel for pixel.
 
     Args:
         title: Title of the window.
@@ -80,10 +80,10 @@ def opened(title: str, picture: NDArray[np.uint8], height_below: int = 0) -> tup
     height, width, _ = picture.shape
     size = width / DPI, (height + height_below) / DPI
     try:
-        # Not by itself, as a notebook would where it is interactive: it is shown once, by `Figure.show`.
+        # Not in interactive mode, in which a notebook would show it already: `Figure.show` does, once.
         with pyplot.ioff():
             figure = pyplot.figure(figsize=size, dpi=DPI, facecolor=picture[0, 0] / 255)
-    # What a backend raises where it meets no display is its own: Tk's TclError is nothing but an Exception.
+    # Without a display each backend raises its own exception: Tk's TclError derives from Exception alone.
     except Exception as error:
         raise _no_display(" ".join(str(error).split())) from error
     if figure.canvas.manager is not None:

@@ -1,4 +1,4 @@
-"""The agent to evaluate: of a tracked run, or described by a configuration."""
+"""The agent to evaluate: from a tracked run, or from a configuration."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from armscan.tracking.lookup import FoundRun, load_run
 from armscan.tracking.tags import DOMAIN_TAG, EVALUATED_TAG
 from armscan.training import CheckpointProvenance, Fingerprints, TrainingDomain, load_weights
 
-# Files and folders that the section `data` names.
+# Keys of the section `data` that hold paths.
 PATHS = ("path", "cache_dir")
 
 
@@ -30,10 +30,10 @@ class TrainedAgent:
         name: Name of the agent in tables and files.
         config: Resolved configuration, with the requested changes.
         run: Run that trained it; None for an agent without a run.
-        weights: Weights of a learner; None if its run has kept none.
+        weights: Weights of a learner; None if its run has none.
         n_env_steps: Environment steps that it was trained for.
-        domain: Training domain; None if its run has not kept it.
-        volumes: Fingerprints of its run's volumes; None if the run has not kept them.
+        domain: Training domain; None if its run has none.
+        volumes: Fingerprints of its run's volumes; None if the run has none.
     """
 
     name: str
@@ -55,7 +55,7 @@ def agent_of_run(tracking: str, run_id: str, changes: Mapping[str, Any], *, trus
         trust: Whether its configuration may name classes that are not armscan's. Default: False.
 
     Raises:
-        ArmscanError: If there is no such run, it has kept too little, or what it has kept is damaged.
+        ArmscanError: If there is no such run, or its artifacts are missing or damaged.
     """
     run = load_run(tracking, run_id)
     if EVALUATED_TAG in run.tags:
@@ -63,7 +63,7 @@ def agent_of_run(tracking: str, run_id: str, changes: Mapping[str, Any], *, trus
     with tempfile.TemporaryDirectory() as folder:
         config = from_its_folder(changed(OmegaConf.create(run.config(Path(folder), trust=trust)), changes), run.tags)
         weights, facts = _weights(run, Path(folder))
-        # Of learners that were trained before runs kept them, the checkpoint has them.
+        # Older runs of learners have them in the checkpoint only.
         volumes = run.volumes(Path(folder)) or facts.get("volumes") or None
     domain = TrainingDomain.from_json(run.tags[DOMAIN_TAG]) if DOMAIN_TAG in run.tags else None
     return TrainedAgent(run.name, config, run, weights, int(facts.get("n_env_steps", 0)), domain, volumes)
@@ -90,7 +90,7 @@ def changed(config: DictConfig, changes: Mapping[str, Any]) -> DictConfig:
     """Return the configuration with changed rules, by the names in `CHANGES`.
 
     Raises:
-        InvalidValueError: If the configuration has no place for one, or lacks a section.
+        InvalidValueError: If the configuration lacks such a key, or a section.
     """
     check_sections(config)
     for name, value in changes.items():
@@ -102,7 +102,7 @@ def changed(config: DictConfig, changes: Mapping[str, Any]) -> DictConfig:
 
 
 def from_its_folder(config: DictConfig, tags: Mapping[str, str]) -> DictConfig:
-    """Return a run's configuration with absolute paths of its data, not relative to where it was started."""
+    """Return a run's configuration with the paths of its data made absolute, from the folder where it was started."""
     for key in PATHS:
         if isinstance(path := config.data.get(key), str) and "working_folder" in tags:
             config.data[key] = str(Path(tags["working_folder"], path))
@@ -117,6 +117,6 @@ def _weights(run: FoundRun, folder: Path) -> tuple[dict[str, Any] | None, dict[s
         weights, facts = load_weights(path)
         CheckpointProvenance(run_id=run.run_id).check(path, facts)
     except CheckpointError as error:
-        # The file lies in a folder that is gone when this is read.
+        # The file's temporary folder is gone by the time the message is read.
         raise CheckpointError(f"run {run.run_id}: {str(error).replace(str(path), path.name)}") from error
     return weights, facts

@@ -1,4 +1,4 @@
-"""The report of an evaluation: metrics with intervals by split and by volume, as JSON, for MLflow, as tables."""
+"""The report of an evaluation: metrics with intervals by split and by volume, as JSON, MLflow metrics and tables."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from armscan.training.metrics import MIN_SURE, NOT_STARTED_SOLVED, SUREST
 from armscan.utils.rate_text import formatted
 
 TOTAL = "all volumes"
-# What MLflow takes in the name of a metric.
+# Characters that MLflow refuses in the name of a metric.
 REFUSED_BY_MLFLOW = re.compile(r"[^A-Za-z0-9_\-. /:]")
 AGENT = "agent"
-# What the table of results has no room for.
+# Metrics for which the table of results has no room.
 FURTHER_ROWS = (
     ("final reward, mean", "mean_final_reward", "{:.3f}"),
     ("best reward, mean", "mean_best_reward", "{:.3f}"),
@@ -33,7 +33,7 @@ FURTHER_ROWS = (
     ("steps, 95th percentile", "p95_steps", "{:.1f}"),
     ("time per plane (ms), mean", "mean_seconds_per_plane", "{:.2f}"),
 )
-# Of agents that say how far off they expect to be.
+# Metrics of agents that predict their own errors.
 BY_EXPECTED_ERROR = tuple(
     (f"{title} of the {which} quarter, median", f"median_distance_{unit}{suffix}", "{:.2f}")
     for unit, title in (("mm", "distance mm"), ("deg", "angle °"))
@@ -48,7 +48,7 @@ class EvaluationReport:
 
     Args:
         evaluations: Evaluations by the name of their volumes, such as `test volumes`.
-        has_total: Whether to add up all evaluations too; False if the agent was trained on some of the volumes.
+        has_total: Whether to pool all evaluations too; False if the agent was trained on some of the volumes.
         facts: Agent, data and settings of the evaluation, as plain values for the JSON file.
         baselines: Episodes of the baselines, by their names, then by the name of the volumes. Default: none.
     """
@@ -60,7 +60,7 @@ class EvaluationReport:
 
     @cached_property
     def by_split(self) -> dict[str, MetricEstimates]:
-        """Return the metrics by the name of the volumes, and those of all together under `all volumes`."""
+        """Return the metrics by the name of the volumes, and the pooled ones under `all volumes`."""
         played, randoms = self._played(self.evaluations), self._played(self.baselines.get(RANDOM, {}))
         return {
             label: beside_random(MetricEstimates.of(each), [each], randoms.get(label)) for label, each in played.items()
@@ -68,14 +68,14 @@ class EvaluationReport:
 
     @cached_property
     def baselines_by_split(self) -> dict[str, dict[str, MetricEstimates]]:
-        """Those of the baselines, by their names, then as `by_split`."""
+        """Return the metrics of the baselines, by their names, then as `by_split`."""
         return {
             name: {label: MetricEstimates.of(each) for label, each in self._played(evaluations).items()}
             for name, evaluations in self.baselines.items()
         }
 
     def tables(self) -> dict[str, ResultTable]:
-        """Return the agent beside the baselines, by the name of the volumes."""
+        """Return the tables of agent and baselines, by the name of the volumes."""
         tables = {}
         for label, figures in self.by_split.items():
             baselines = {name: each[label] for name, each in self.baselines_by_split.items()}
@@ -84,7 +84,7 @@ class EvaluationReport:
         return tables
 
     def _played(self, evaluations: Mapping[str, Evaluation]) -> dict[str, Evaluation]:
-        """Return evaluations by the name of their volumes, with all of them together if they are to be pooled."""
+        """Return evaluations by the name of their volumes, and the pooled one if there is a total."""
         if not self.has_total or len(evaluations) < 2:
             return dict(evaluations)
         return {**evaluations, TOTAL: Evaluation.pooled([*evaluations.values()])}
@@ -126,7 +126,7 @@ class EvaluationReport:
         }
 
     def metrics(self) -> dict[str, dict[str, float]]:
-        """Return the metrics by their origin: `test_volumes`, `volume/NAME`."""
+        """Return the metrics by their origin: `test_volumes`, `volume/NAME`, `BASELINE/test_volumes`."""
         groups = {label.replace(" ", "_"): metrics.metrics() for label, metrics in self.by_split.items()}
         for volumes in self.by_volume.values():
             for name, metrics in volumes.items():
@@ -139,7 +139,7 @@ class EvaluationReport:
 
 
 def report_tables(report: EvaluationReport, width: int) -> list[Table | Text]:
-    """Return the tables beside those of the results: each volume of each group, and further figures.
+    """Return the tables to print after the results: each volume of each group, and further figures.
 
     Args:
         report: Report to show.

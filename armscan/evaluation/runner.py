@@ -22,7 +22,7 @@ from armscan.training.domain import smallest_slice
 from armscan.training.episode_results import Env
 from armscan.utils.console import print_sentence
 
-# First seed of an evaluation's episodes: none of them is played by a run, whose seeds lie below.
+# First seed of an evaluation's episodes, above the seeds of a run's own evaluations.
 FIRST_SEED = 5 * 10**6
 PIXEL_TOLERANCE = 0.1
 MAX_REASON_CHARS = 250
@@ -59,7 +59,7 @@ class PreparedAgent:
             tell: Function that receives the progress. Default: none.
 
         Returns:
-            The episodes by what their volumes are called, and those of each baseline by its name.
+            The agent's episodes, by the name of their volumes; and the same for each baseline, by its name.
         """
         evaluations: dict[str, Evaluation] = {}
         baselines: dict[str, dict[str, Evaluation]] = {}
@@ -93,7 +93,7 @@ def apply(
     Raises:
         ArmscanError: If volumes are missing or damaged, or the agent cannot be applied to them.
     """
-    # Elsewhere, of an agent's own volumes only those matter that its reward is fitted to.
+    # On other volumes, only the training volumes matter among its own: the reward is fitted to them.
     parts = ("training",) if data else PARTS
     own = cache(partial(own_split, source, parts))
     groups = volume_groups(data, n_phantoms, own)
@@ -121,7 +121,7 @@ def prepare(
         render_mode: Gymnasium render mode of the environments. Default: None.
 
     Raises:
-        ArmscanError: If the agent cannot be applied to the volumes; the reason is said.
+        ArmscanError: If the agent cannot be applied to the volumes; the message says why.
     """
     envs: dict[str, Env] = {}
     notes: list[str] = []
@@ -136,7 +136,7 @@ def prepare(
         here = TrainingDomain.of(envs[label])
         if source.domain is not None:
             notes += [f"{label}: {difference}" for difference in source.domain.differences(here)]
-        # Of a run that has not kept what its agent was trained on, all volumes must at least look alike.
+        # If a run has no training domain, the groups of volumes must at least match each other.
         trained = trained or here
         trained.check_observed(here)
         if agent is None:
@@ -176,7 +176,7 @@ def _load_weights(agent: Agent, source: TrainedAgent) -> None:
     try:
         agent.load_weights(source.weights)
     except CheckpointError as error:
-        # torch lists every name that it misses, and every one that it does not know.
+        # torch lists every missing and every unexpected name.
         raise CheckpointError(f"run {source.run.run_id}: {shorten(str(error), MAX_REASON_CHARS)}") from error
 
 

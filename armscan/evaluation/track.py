@@ -1,4 +1,4 @@
-"""An evaluation with its report: as a JSON file, and as an MLflow run below the run that is evaluated."""
+"""Evaluate an agent, and keep the report: as a JSON file, and as an MLflow run below the evaluated run."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from armscan.utils.files import check_writable
 from armscan.volumes import LabelVolume, load_phantoms, open_dataset
 from armscan.volumes.dataset import SPLITS
 
-# No phantom of a run has these seeds: its test phantoms begin a million below.
+# Above the seeds of a run's phantoms: its test phantoms begin a million below.
 PHANTOMS_FIRST_SEED = 3_000_000
 Volumes = dict[str, LabelVolume]
 
@@ -28,10 +28,10 @@ def own_split(source: TrainedAgent, parts: Sequence[str] = PARTS) -> Split:
 
     Args:
         source: Agent whose volumes are read.
-        parts: Parts of the split in which the volumes must be those that the run was started with.
+        parts: Parts of the split whose volumes must not have changed since the run was started.
 
     Raises:
-        ChangedVolumesError: If they are not.
+        ChangedVolumesError: If they have.
         InvalidValueError: If they cannot be read.
     """
     run = source.run
@@ -76,7 +76,7 @@ def data_name(data: str | None) -> str:
 
 
 def file_name(text: str) -> str:
-    """Return a string in a form that can name a file."""
+    """Return a string as a valid file name."""
     return re.sub(r"[^\w.\-]+", "-", text)
 
 
@@ -84,7 +84,7 @@ def check_out(file: Path, out: Path | None, what: str) -> None:
     """Check that a file can be written, before the agent plays for hours.
 
     Raises:
-        InvalidValueError: If none can be written there; it names `--out` and `what` would be written.
+        InvalidValueError: If it cannot be written; the message names `--out` and `what`.
     """
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -95,7 +95,7 @@ def check_out(file: Path, out: Path | None, what: str) -> None:
 
 
 def known_volumes(source: TrainedAgent, groups: Mapping[str, Volumes]) -> list[str]:
-    """Return a sentence for each use that an agent's run made of these volumes, or of others with their names.
+    """Return a sentence for each way in which an agent's run used these volumes, or others with their names.
 
     Args:
         source: Agent of a run.

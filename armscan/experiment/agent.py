@@ -60,7 +60,7 @@ def make_agent(
     )
     agent = algorithm.agent(setup)
     _check_learner(agent)
-    # All of them now: what one refuses is told before anything is trained.
+    # All of them now, so that errors come before anything is trained.
     later: list[tuple[int, Any]] = [
         (start, each.agent(setup)) for start, each in scheduled_algorithms(algorithm, schedule)
     ]
@@ -68,7 +68,7 @@ def make_agent(
 
 
 def _vector_envs(env_factory: EnvFactory, volumes: Mapping[str, LabelVolume]) -> VectorEnvFactory:
-    """Return what makes vector environments on these volumes, which the caller resets."""
+    """Return a factory of vector environments on these volumes, without autoreset."""
     return partial(env_factory.make_vector_env, volumes=dict(volumes), autoreset_mode="Disabled")
 
 
@@ -86,7 +86,7 @@ def make_algorithm(config: DictConfig) -> Algorithm:
     """Return the algorithm that makes the agent.
 
     Raises:
-        InvalidValueError: If the section `agent` describes none, or a hyperparameter is not allowed.
+        InvalidValueError: If the section `agent` describes no algorithm, or a hyperparameter is not allowed.
     """
     algorithm: Algorithm = instantiate(config.agent, _convert_="object")
     if not callable(getattr(algorithm, "agent", None)):

@@ -105,7 +105,7 @@ def set_up(config: DictConfig) -> Experiment:
     """Build an experiment with the environments of its evaluations, and check them, before tracking starts.
 
     Raises:
-        InvalidValueError: If something in it is not allowed, or the agent cannot act in one of the environments.
+        InvalidValueError: If a value is not allowed, or the agent cannot act in one of the environments.
     """
     silence_libraries()
     experiment = build_experiment(config)
@@ -114,14 +114,14 @@ def set_up(config: DictConfig) -> Experiment:
     for env in envs[1:]:
         trained.check_observed(TrainingDomain.of(env))
     if not isinstance(experiment.agent, Learner):
-        # How many planes there are to go through depends on the sizes of the volumes.
+        # Checks the number of planes of a sweep, which depends on the sizes of the volumes.
         for bounds in {bounds for env in envs for bounds in env.get_wrapper_attr("rules").bounds.values()}:
             experiment.agent.begin(seed=0, bounds=bounds)
     return experiment
 
 
 def build_experiment(config: DictConfig, split: Split | None = None) -> Experiment:
-    """Build an experiment from its composed configuration, on volumes that have been read already, or read here."""
+    """Build an experiment from its composed configuration; without `split`, the volumes are read too."""
     check_words(config)
     seed = check_seed("seed", config.seed)
     n_episodes = check_int("evaluation.episodes", config.evaluation.episodes, at_least=1)
@@ -156,7 +156,7 @@ def check_words(config: DictConfig) -> None:
 
     Raises:
         InvalidValueError: If a value is not allowed.
-        MissingMandatoryValue: If one that must be given is not.
+        MissingMandatoryValue: If a mandatory value is missing.
     """
     check_sections(config)
     to_plain(config)
@@ -170,13 +170,13 @@ def check_words(config: DictConfig) -> None:
 
 
 def on_plane_of(config: DictConfig) -> tuple[OnPlane, ...]:
-    """Return the limits within which a plane counts as the labelled one; those by default for older runs."""
+    """Return the limits within which a plane counts as the labelled one; the default limits for older runs."""
     node = config.evaluation.get("on_plane", ON_PLANE)
     return check_on_plane("evaluation.on_plane", OmegaConf.to_container(node) if OmegaConf.is_config(node) else node)
 
 
 def apply_crop(config: DictConfig, trained_px: tuple[int, int], here_px: tuple[int, int]) -> DictConfig:
-    """Return the configuration with images cropped alike on all volumes, as `with_crops` says."""
+    """Return the configuration with images cropped alike on all volumes; see `with_crops`."""
     node = config.env.observation
     rules = OmegaConf.to_container(node) if OmegaConf.is_config(node) else node
     cropped = config.copy()
@@ -193,7 +193,7 @@ def make_env_factory(config: DictConfig, training: Mapping[str, LabelVolume]) ->
 def check_keys(config: DictConfig) -> None:
     """Raise `InvalidValueError` if a key was added that nothing reads.
 
-    Sections that objects are made of refuse such keys by themselves.
+    Sections that Hydra instantiates refuse such keys themselves.
     """
     check_sections(config)
     for node, where, allowed in (

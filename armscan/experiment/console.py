@@ -1,4 +1,4 @@
-"""Tables of results, and where to look for more, in the terminal."""
+"""Print tables of results, and where to look for more, in the terminal."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from armscan.utils.files import ID_CHARS
 
 
 def print_table(title: str, table: ResultTable, notes: Iterable[str] = (), *, how: bool = True) -> None:
-    """Print a table of results, as it fits the terminal.
+    """Print a table of results that fits the terminal.
 
     Args:
         title: Line above the table.

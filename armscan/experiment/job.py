@@ -1,6 +1,6 @@
 """The invocation of a run: its folder, its overrides, and its job of a multirun.
 
-It imports nothing that takes time, because a multirun's launcher needs it for every job.
+It has no slow imports, because a multirun's launcher imports it for every job.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class Job:
         folder = Path(hydra_config.sweep.dir)
         word = json.loads((folder / PARENT_FILE).read_text())
         overrides = list(hydra_config.overrides.task)
-        # Hydra hands a truth value on as it writes it, False for false.
+        # Hydra passes booleans on in Python's spelling, False for false.
         common = {override.lower() for override in word["overrides"]}
         varied = [override for override in overrides if override.lower() not in common]
         words = shlex.join(overrides), " ".join(varied)
@@ -94,7 +94,7 @@ class Invocation:
     """The invocation of a run.
 
     Args:
-        folder: Folder that takes the run's files.
+        folder: Folder of the run's files.
         overrides: Overrides on the command line.
         command: Command line; for a job, the one that repeats it alone.
         choices: Choice of each configuration group.
@@ -123,7 +123,7 @@ class Invocation:
 def remove_if_untracked(folder: Path, error: BaseException) -> None:
     """Remove the files of a run that failed before it was tracked; a tracked run can be resumed."""
     is_tracked = (folder / CONFIG_FILE).exists() and not isinstance(error, FolderTakenError)
-    # Where somebody else is at work in the folder, everything is theirs.
+    # If another process is using the folder, its files are that process's.
     if not is_tracked and not isinstance(error, FolderInUseError):
         remove_run_folder(folder)
 
@@ -138,7 +138,7 @@ def remove_run_folder(folder: Path) -> None:
     outboxes = [file for suffix in OUTBOX_SUFFIXES for file in (folder / OUTBOX_FOLDER).glob(RUN_ID + suffix)]
     for ours in (folder / PARENT_FILE, folder / "multirun.yaml", folder / LOCK_FILE, *outboxes):
         ours.unlink(missing_ok=True)
-    # Somebody else's is not empty.
+    # Another run's outbox is not empty.
     with contextlib.suppress(OSError):
         (folder / OUTBOX_FOLDER).rmdir()
     here = Path.cwd()

@@ -39,7 +39,7 @@ from armscan.utils.files import (
 )
 
 CHOICES_IN_TAGS = ("data", "obs", "reward", "agent", "network")
-# Of a volume's fingerprint in a tag; the whole stands in a file.
+# Length of a volume's fingerprint in a tag; `volumes.json` has the whole.
 N_PRINT_CHARS = 16
 
 
@@ -53,7 +53,7 @@ def start_tracking(
 ) -> TrackedRun:
     """Write the provenance files, open the tracking store and start a run in it.
 
-    Files of an earlier run in the folder are replaced; `check_free` has found them to be a run's.
+    Files of an earlier run in the folder are replaced; `check_free` has checked that they are a run's.
 
     Args:
         config: Composed configuration.
@@ -67,10 +67,10 @@ def start_tracking(
     deliver_pending(client)
     choices, job = invocation.choices, invocation.job
     files = provenance_files(resolved, setup)
-    # Those of an earlier run, left in a folder that somebody named: they would be taken for this one's.
+    # Results of an earlier run in the same folder would be taken for this run's.
     for stale in RESULTS:
         (invocation.folder / stale).unlink(missing_ok=True)
-    # Before the run is there: whenever it is killed, it can be resumed.
+    # Before the run exists, so that it can be resumed whenever it is killed.
     for name, contents in files.items():
         atomic_write(invocation.folder / name, methodcaller("write", contents))
     tracked = TrackedRun.start(
@@ -85,7 +85,7 @@ def start_tracking(
             "overrides": " ".join(invocation.overrides),
             **{f"{CHOICE}{group}": choices[group] for group in CHOICES_IN_TAGS},
             **volume_tags(setup.fingerprints),
-            # Where it is applied to other volumes, later, the agent must see what it has learned to see.
+            # On other volumes, an evaluation must reproduce the agent's observations.
             DOMAIN_TAG: TrainingDomain.of(setup.training_env, setup.smallest_slice_px).to_json(),
             **place_tags(invocation.folder),
             "working_folder": str(Path.cwd()),
@@ -132,7 +132,7 @@ def place_tags(folder: Path) -> dict[str, str]:
 
 
 def run_name(config: dict[str, Any], choices: dict[str, str]) -> str:
-    """Return the name of a run in the UI: the choices that most runs differ by."""
+    """Return the name of a run in the UI: the choices by which most runs differ."""
     projection = config["projection"]
     parts = [choices["agent"], choices["obs"], projection if isinstance(projection, str) else "+".join(projection)]
     parts += [f"{name}{config[name]}" for name, without in (("stack", 1), ("memory", 0)) if config[name] != without]

@@ -39,10 +39,10 @@ TITLES = {
     LAST_VALIDATION: f"agent, {LAST_VALIDATION}",
     TRAINING: "agent, training",
 }
-# Metrics of evaluations have this among them, below the name of their group, which a run shortens.
+# Every evaluation tracks this metric, below the name of its group; `NAMES` maps these names to those of the volumes.
 EVALUATED = "/success_rate"
 NAMES = {name.replace(" ", "_"): name for name in (TEST, TRAINING)} | {"validation": LAST_VALIDATION}
-# Metrics of a model of MLflow, beside the on-plane rates.
+# Metrics of a run's MLflow model, besides the on-plane rates.
 OF_MODEL = ("median_distance_mm", "median_distance_deg", "success_rate", "mean_steps")
 # With fewer volumes intervals are clearly too narrow: docs/metrics.md.
 MIN_VOLUMES = 8
@@ -109,13 +109,13 @@ class RunResult:
         return metrics
 
     def markdown(self) -> str:
-        """Return the table of the agent on the test volumes and the baselines there, and the notes, in Markdown."""
+        """Return the table of agent and baselines on the test volumes, and the notes, in Markdown."""
         shown = {name: each for name, each in self.figures.items() if name == TEST or name in self.baselines}
         table = result_table({name: each for name, each in shown.items() if name != self.own_baseline})
         return "\n\n".join([table.markdown(), *self.notes()])
 
     def model_metrics(self) -> dict[str, list[str]]:
-        """Return the names of the metrics that describe the run's checkpoint, by the part of their volumes."""
+        """Return the names of the metrics that describe the run's checkpoint, by split."""
         names = [*(limits.metric for limits in self.evaluations[TEST].on_plane), *OF_MODEL]
         groups = {"test": TEST.replace(" ", "_"), "validation": "validation"}
         return {part: [f"{group}/{name}" for name in names] for part, group in groups.items()}
@@ -125,7 +125,7 @@ class RunResult:
         return volume_notes(self.figures[TEST], self.figures.get(VALIDATION))
 
     def write(self, folder: Path, *, title: str) -> None:
-        """Write all episodes, and a page with the table, into the folder of the run."""
+        """Write all episodes, and a page with the table, to the folder of the run."""
         for file, evaluations in ((EVALUATION_FILE, self.evaluations), (BASELINES_FILE, self.baselines)):
             contents = {name: evaluation.to_dict() for name, evaluation in evaluations.items()}
             atomic_write(folder / file, methodcaller("write", json.dumps(contents, indent=1).encode()))
@@ -135,7 +135,7 @@ class RunResult:
 
 
 def result_table(figures: Mapping[str, MetricEstimates]) -> ResultTable:
-    """Return the table of figures by the names of the agent's volumes and of the baselines, the test volumes first."""
+    """Return the table of figures, by the names of the agent's volumes and of the baselines, test volumes first."""
     of_agent = [name for name in TITLES if name in figures and name != TEST]
     baselines = [name for name in figures if name not in TITLES]
     ordered = [*([TEST] if TEST in figures else []), *baselines, *of_agent]

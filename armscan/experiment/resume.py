@@ -1,7 +1,7 @@
 """`armscan run resume=ID`: resume an interrupted run, with the results of an uninterrupted one, or complete a grid.
 
-A changed configuration, changed volumes, and checkpoints that are damaged or of another run are refused before anything
-of the run is touched.
+A changed configuration, changed volumes, and checkpoints that are damaged or another run's are refused before training
+continues.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def resume(words: Sequence[str], repeat_grid: Callable[[Sequence[str]], None]) -
     Raises:
         InvalidValueError: If the words say anything else.
         UntrustedError: If it would execute code of others, and the words have no `--trust`.
-        ArmscanError: If there is no such run, it is still going on, or its checkpoint or volumes are not its own.
+        ArmscanError: If there is no such run, it is still running, or its checkpoint or volumes are not its own.
     """
     trust = TRUST in words
     wanted, uri = _read([word for word in words if word != TRUST])
@@ -79,7 +79,7 @@ def _grid_of(run: Run) -> list[str]:
 
 
 def _tag(run: Run, name: str) -> str:
-    """Return a tag that every run of armscan has."""
+    """Return a tag that every run of `armscan run` has."""
     try:
         return str(run.data.tags[name])
     except KeyError as error:
@@ -105,7 +105,7 @@ def resume_run(
     """Resume a run; see `resume`. The printed lines of a multirun's job begin with its label."""
     folder = _folder_of(client.get_run(run_id))
     with folder_lock(folder):
-        # What it has left because the store was unavailable; it may have ended just before the folder was free.
+        # Send what it could not send before; it may also have finished just before the lock was free.
         sync(folder, lambda _: client)
         run = client.get_run(run_id)
         _check_unfinished(run)
@@ -148,7 +148,7 @@ def _folder_of(run: Run) -> Path:
             f"run {run_id} cannot be resumed: it was not started by armscan run, which tags a run with its folder"
         )
     check_version(run)
-    # Asked before the folder, which may have been cleared away since.
+    # Checked before the folder, which may have been deleted since.
     _check_unfinished(run)
     folder = Path(tags[FOLDER_TAG])
     if not folder.is_dir():
@@ -200,7 +200,7 @@ def _check_last_checkpoint(run: Run, folder: Path) -> None:
 
 def _check_volumes(run: Run, folder: Path, now: Fingerprints) -> None:
     """Raise `ChangedVolumesError` if a run would continue with other volumes, whether it has a checkpoint or not."""
-    # Of runs that were started before it was kept, the checkpoint says so.
+    # Older runs have no such record; their checkpoint holds the fingerprints.
     if SHA256_TAGS[VOLUMES_FILE] in run.data.tags:
         record = folder / VOLUMES_FILE
         then = fingerprints_in(_started_with(run, record, "record of its volumes"), str(record))
@@ -208,11 +208,11 @@ def _check_volumes(run: Run, folder: Path, now: Fingerprints) -> None:
 
 
 def _enter_working_folder(run: Run) -> None:
-    """Change to the working folder of the run, from where its configuration names files."""
+    """Change to the working folder of the run, where its relative paths begin."""
     folder = _tag(run, "working_folder")
     try:
         os.chdir(folder)
-    # Also for what no path can have.
+    # ValueError: the path has characters that no path can have.
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise ResumeError(

@@ -43,7 +43,7 @@ from armscan.utils.files import (
 )
 from armscan.utils.processes import no_garbage_collection
 
-# First seeds of the episodes that are played for each purpose, so that none is played for two; see also `results`.
+# First seeds of the episodes for each purpose, so that no episode serves two; see also `results`.
 VALIDATION_SEED, VIDEO_SEED = 10**6, 4 * 10**6
 OF_ENVIRONMENT = ("armscan.volumes", "armscan.anatomy", "armscan.envs")
 COMPILING = "compiling the environment for this machine, which takes half a minute; later runs find it in the cache"
@@ -81,7 +81,7 @@ def run_tracked(
     Args:
         setup: Experiment to run.
         tracked: Run that tracks it.
-        folder: Folder that takes the run's files.
+        folder: Folder of the run's files.
         tracking_uri: MLflow tracking URI.
         job_label: Prefix of the printed lines of a multirun's job. Default: None, a single run.
         earlier: Epochs before the interruption of a resumed training. Default: none.
@@ -120,7 +120,7 @@ def run_tracked(
         keep_results(tracked, result, reached, folder)
         if isinstance(setup.agent, Learner):
             with no_garbage_collection():
-                # Deferred: exporting a policy loads more than training does, and is the last that a run does.
+                # Deferred: exporting a policy loads more than training does, and comes last.
                 from armscan.policies.build import save_policy
 
                 save_policy(setup.agent, setup.test_env, tracked, folder, tell)
@@ -188,7 +188,7 @@ def keep_results(tracked: TrackedRun, result: TrainingResult | None, reached: Ru
         result: Result of the training. Figures are logged at its best epoch, whose weights they evaluate. None if there
             was nothing to learn.
         reached: Final evaluations, and the baselines.
-        folder: Folder of the run, which gets the picture of the learning curve, the episodes and the table.
+        folder: Folder of the run; takes the picture of the learning curve, the episodes and the table.
     """
     log_result(tracked, result, reached)
     if result:
@@ -201,7 +201,7 @@ def log_result(tracked: TrackedRun, result: TrainingResult | None, reached: RunR
     """Log the final figures, the best checkpoint as a model, and the table as description; see `keep_results`."""
     for name, metrics in reached.metrics().items():
         figures = {f"{name.replace(' ', '_')}/{figure}": value for figure, value in metrics.items()}
-        # The last validation is logged by the training.
+        # Training has already logged the validations.
         if name != VALIDATION:
             tracked.log_metrics(figures, n_env_steps=result.best.n_env_steps if result else 0)
     if result:

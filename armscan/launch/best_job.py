@@ -14,14 +14,14 @@ from armscan.training.baselines import RANDOM
 from armscan.training.metric_display import leading_among
 
 TESTED = "test_volumes/"
-# Of the grid's run: which job its figures are of.
+# Tag of the grid's run: the run that its figures come from.
 BEST_TAG = "best.run"
 
 
 def best_of(runs: Sequence[Run]) -> Run | None:
     """Return the run with the highest on-plane rate on its test volumes; None if no run was evaluated."""
     names = {name for run in runs for name in run.data.metrics if name.startswith(f"{TESTED}{PREFIX}")}
-    # By other limits, where the configuration has others.
+    # Other limits, if the configuration replaces the usual ones.
     usual = f"{TESTED}{ON_PLANE[0].metric}"
     rate = usual if usual in names or not names else min(names)
     evaluated = [run for run in runs if rate in run.data.metrics]
@@ -29,9 +29,9 @@ def best_of(runs: Sequence[Run]) -> Run | None:
 
 
 def show_best(store: TrackingStore, parent_id: str, jobs: Sequence[Run]) -> None:
-    """Log the leading figures of the best job and its random agent to the run of a grid, in the columns of its jobs.
+    """Log the leading figures of the best job and its random agent to the run of a grid, under the names of its jobs'.
 
-    Jobs of different folds have different volumes, and none is the best.
+    Jobs of different folds have different test volumes, so none of them is the best.
     """
     if (best := best_of(jobs)) is None or len({job.data.params.get(FOLD) for job in jobs}) > 1:
         return

@@ -29,7 +29,7 @@ TEST_GROUP = TEST.replace(" ", "_")
 def folds_table(runs: Iterable[tuple[Path, str]]) -> ResultTable | None:
     """Return one table over the folds of a grid, with the baselines; None if it is not a grid of folds.
 
-    Every subject is tested on once for each seed, so that intervals draw wrists, as those of one run do.
+    Every subject is tested once for each seed, so that intervals resample volumes, as those of one run do.
 
     Args:
         runs: Folder of each run, and its overrides that differ from those of the others.
@@ -44,7 +44,7 @@ def folds_table(runs: Iterable[tuple[Path, str]]) -> ResultTable | None:
         others = " ".join(f"{key}={value}" for key, value in words.items())
         for name, evaluation in _evaluations(folder).items():
             title = ", ".join(filter(None, (name, others)))
-            # A baseline plays the same episodes whatever the seed of a training: they count once.
+            # A baseline plays the same episodes for every training seed: they count once.
             training_of = training if name == AGENT else ""
             tested.setdefault(title, {}).setdefault(training_of, {})[fold] = evaluation
     joined = {
@@ -70,10 +70,10 @@ def _evaluations(folder: Path) -> dict[str, Evaluation]:
 
 
 def keep_table(table: ResultTable, folder: Path, store: TrackingStore, run_id: str, notes: Sequence[str]) -> None:
-    """Keep the table of all folds in the grid's folder, and with its figures in the grid's run.
+    """Save the table of all folds in the grid's folder, and the table with its figures in the grid's run.
 
     Args:
-        table: Table to keep.
+        table: Table to save.
         folder: Folder of the grid.
         store: Store of the grid's run.
         run_id: MLflow run ID of the grid.
@@ -95,7 +95,7 @@ def keep_table(table: ResultTable, folder: Path, store: TrackingStore, run_id: s
     metrics = [
         Metric(f"{group}/{name}", value, time_ms, 0)
         for title, group in groups.items()
-        # Of several kinds of runs the page tells.
+        # If runs also differ in other settings, only the page has their figures.
         if title.endswith(ALL_FOLDS)
         for name, value in table.results[title].shown_metrics(column.metric for column in table.quantities).items()
         if math.isfinite(value)

@@ -1,4 +1,4 @@
-"""Jobs of a grid, before it is run: their plan, and the check of their words."""
+"""Jobs of a grid, before it runs: print them, and check their overrides."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from armscan.config.sources import SWEEP
 from armscan.errors import ArmscanError, InvalidValueError
 from armscan.launch.folds_grid import with_folds
 
-# Words of which Hydra alone knows the jobs.
+# With these words, only Hydra knows the jobs.
 NOT_CHECKED = ("-", "hydra/sweeper", "hydra.sweeper")
 
 
@@ -27,7 +27,7 @@ def print_grid_plan(words: Sequence[str]) -> None:
         words: Words of the command line.
 
     Raises:
-        InvalidValueError: If they are of a single run.
+        InvalidValueError: If they describe a single run.
         HydraException: If a job cannot be composed.
     """
     overrides = [word for word in with_folds([word for word in words if word != PLAN]) if word not in MULTIRUN]
@@ -37,26 +37,25 @@ def print_grid_plan(words: Sequence[str]) -> None:
             f"{PLAN} is given, but this is a single run: it shows the jobs of a grid, and what a study searches "
             f"({SWEEP}=NAME)"
         )
-    varied = {each.input_line for each in parsed if not each.is_sweep_override()}
+    fixed = {each.input_line for each in parsed if not each.is_sweep_override()}
     print(f"a grid of {len(jobs)} jobs")
     for number, job in enumerate(jobs):
-        # Raises what the job would.
+        # Raises the error that the job would.
         compose(job)
-        print(f"{number:4d}  {' '.join(word for word in job if word not in varied)}")
+        print(f"{number:4d}  {' '.join(word for word in job if word not in fixed)}")
 
 
 def check_grid(words: Sequence[str]) -> None:
-    """Raise the error of the first job if the words of every job of a grid are wrong; others run beside wrong ones.
+    """Raise the error of the first job if all jobs of a grid have wrong overrides; otherwise the correct ones run.
 
     Args:
-        words: Words of the command line; those of a single run, or of another sweeper than Hydra's basic one, are left
-            to Hydra.
+        words: Words of the command line; a single run, and a sweeper other than Hydra's basic one, are left to Hydra.
     """
     overrides = [word for word in words if word not in MULTIRUN]
     if len(overrides) == len(words) or any(word.startswith(NOT_CHECKED) for word in overrides):
         return
     print("preparing a grid: its words are checked first", flush=True)
-    # Deferred: it loads what checks them, after the first line.
+    # Deferred: it takes time, so the line above comes first.
     from armscan.experiment.build import check_words
 
     errors = []

@@ -1,4 +1,4 @@
-"""Hydra's launchers, as far as armscan has to know them."""
+"""What armscan must know about Hydra's launchers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from armscan.errors import InvalidValueError
 LAUNCHER = "hydra/launcher"
 ON_THIS_MACHINE = ("basic", "joblib", "submitit_local")
 SLURM, RAY = "submitit_slurm", "ray"
-# The extra of armscan that installs what a launcher imports, and what that is.
+# By launcher: the extra of armscan that installs its packages, and their names.
 IMPORTED = {
     SLURM: ("slurm", ("submitit", "hydra_plugins.hydra_submitit_launcher")),
     RAY: ("ray", ("ray", "hydra_plugins.hydra_ray_launcher")),
@@ -35,7 +35,7 @@ def check_launcher(name: str) -> None:
 def silence_launcher(name: str) -> None:
     """Keep a launcher's messages about waiting off the screen."""
     if name == SLURM:
-        # Where Slurm has no accounting, submitit says so again and again. It sets its level when it is imported.
+        # Without Slurm accounting, submitit warns again and again. Its import sets the level, so it comes first.
         import submitit
 
         logging.getLogger(submitit.__name__).setLevel(logging.ERROR)

@@ -32,18 +32,18 @@ if TYPE_CHECKING:
     from armscan.tracking import TrackingStore
     from armscan.training import ResultTable
 
-# Hydra's own overrides that say that there are several jobs, and where.
+# Hydra's own overrides that select the multirun mode and its folder.
 NOT_REPEATED = ("hydra.mode=", "hydra.sweep.dir=", "hydra.sweep.subdir=")
 
 
 class Multirun(Callback):
     """Starts the parent run before the first job; Hydra calls it in the process that launches the jobs.
 
-    The parent also makes the store's tables, so that jobs starting side by side find them there.
+    Starting the parent also creates the store's tables, before jobs start side by side.
     """
 
     folder: Path | None = None
-    # Whether what has finished of an earlier one is not run again.
+    # Whether this multirun repeats an earlier one, without the jobs that have finished.
     is_repeated = False
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
@@ -62,12 +62,12 @@ class Multirun(Callback):
     @staticmethod
     def _start(config: DictConfig) -> None:
         if config.get("study") is not None:
-            # It has a run of its own, which outlives many starts of workers.
+            # A study has its own run, which continues when workers are started again.
             return
         check_launcher(config.hydra.runtime.choices[LAUNCHER])
         folder = Path(config.hydra.sweep.dir)
         print(f"preparing a multirun in {folder}", flush=True)
-        # Deferred: what loads MLflow comes after the first line.
+        # Deferred: it loads MLflow, after the first line is printed.
         from armscan.tracking import open_store, source
 
         if not isinstance(config.tracking, DictConfig):
@@ -90,7 +90,7 @@ class Multirun(Callback):
 
 @contextmanager
 def _answered() -> Iterator[None]:
-    """Answer an error in one line and leave: Hydra would warn of any exception of a callback, and start the jobs."""
+    """Report an error in one line and exit: Hydra only warns of a callback's exception, and starts the jobs."""
     try:
         yield
     except Exception as error:
@@ -105,14 +105,14 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
         is_interrupted: Whether the multirun was interrupted.
 
     Returns:
-        The exit code: 0 where every job succeeded, or where this was not a multirun; 1 otherwise.
+        The exit code: 0 if every job succeeded, or if this was not a multirun; 1 otherwise.
     """
     if Multirun.folder is None:
         return 0
     folder, outcomes = Multirun.folder, _read_outcomes(Multirun.folder)
     failed = {number: outcome for number, outcome in outcomes.items() if outcome.failure is not None}
     if is_interrupted:
-        # A job that had no outcome by then was interrupted, too, and that is no failure.
+        # A job without an outcome was interrupted, too, which is not a failure.
         unended = {number for number, outcome in failed.items() if outcome.failure in (NO_OUTCOME, INTERRUPTED)}
         outcomes |= {number: replace(failed.pop(number), failure=INTERRUPTED) for number in unended}
     status = "KILLED" if is_interrupted else "FAILED" if failed or not outcomes else "FINISHED"
@@ -167,7 +167,7 @@ def _keep_tables(
     runs: Sequence[Run],
     store: TrackingStore,
 ) -> None:
-    """Keep the table of the jobs and that over all folds; an error is printed, because the grid itself has ended."""
+    """Save the table of the jobs and the one over all folds; an error is only printed, because the grid has ended."""
     from mlflow.exceptions import MlflowException
 
     try:
@@ -178,7 +178,7 @@ def _keep_tables(
 
 
 def _keep_page(table: ResultTable, folder: Path, word: Mapping[str, Any], store: TrackingStore) -> None:
-    """Keep the table of the jobs as a page, in the grid's folder and with its parent run."""
+    """Save the table of the jobs as a page, in the grid's folder and with its parent run."""
     from armscan.reports.html import page
     from armscan.tracking.uploader import leave_note
 
@@ -196,7 +196,7 @@ def _pool_folds(
     runs: Sequence[Run],
     store: TrackingStore,
 ) -> None:
-    """Print one table over all folds of a cross-validation, and keep it with the parent run."""
+    """Print one table over all folds of a cross-validation, and save it in place of the table of the jobs."""
     from armscan.experiment.console import print_table
     from armscan.launch.folds_table import folds_table, keep_table
 
@@ -224,13 +224,13 @@ def _close_parent(
     tags = {f"failure.{number}": f"{each.varied}: {each.failure}" for number, each in failed.items()}
     note_end(folder, word["run_id"], word["tracking"]["uri"], status, tags)
     store, experiment_id = open_store(**word["tracking"], retry_s=word["tracking"]["wait_s"])
-    # With what jobs have left because the store was unavailable.
+    # Uploads what the jobs could not while the store was unavailable.
     sync(folder, lambda _: store)
     below = store.children(experiment_id, word["run_id"])
-    # Others may have put a run of theirs below it.
+    # Users may have nested other runs below it.
     children = [run for run in below if run.data.tags.get(JOB_TAG, "").isdecimal() and FOLDER_TAG in run.data.tags]
     for child in children:
-        # `sync` has ended those whose processes had no time to do so.
+        # `sync` has closed the runs whose processes could not.
         if child.info.status == "RUNNING" or child.data.tags.get(FAILURE_TAG) == PROCESS_DIED:
             is_killed = status == "KILLED"
             store.set_tag(child.info.run_id, FAILURE_TAG, INTERRUPTED if is_killed else NO_OUTCOME)

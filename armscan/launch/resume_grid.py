@@ -1,6 +1,6 @@
 """`armscan run resume=ID` of a grid: repeat it without the jobs that have finished.
 
-A job's earlier run is known by its configuration and its volumes, which both have to be the same to the last value.
+A job's earlier run is found by the checksums of its configuration and its volumes.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def run_again(config: DictConfig, invocation: Invocation, job: Job) -> Metrics:
     check_keys(config)
     setup, tracking = set_up(config), to_plain(config.tracking)
     client, experiment_id = open_store(**tracking)
-    # Of this configuration on these volumes, the latest first.
+    # Runs of this configuration on these volumes, the latest first.
     sums = sha256_tags(provenance_files(to_plain(config), setup))
     wanted = " and ".join(f"tags.`{tag}` = '{value}'" for tag, value in sums.items())
     earlier = client.search_runs([experiment_id], wanted, order_by=["attributes.start_time DESC"])
@@ -45,7 +45,7 @@ def run_again(config: DictConfig, invocation: Invocation, job: Job) -> Metrics:
         folder = run.data.tags.get(FOLDER_TAG)
         if run.info.status != "RUNNING" and folder is not None and (Path(folder) / LAST_CHECKPOINT).exists():
             _adopt(client, run, job)
-            # Its configuration is this job's.
+            # Trusted, because its configuration is this job's.
             return resume_run(client, run.info.run_id, job_label=job.label, trust=True)
     return run_experiment(config, invocation)
 

@@ -27,31 +27,31 @@ from armscan.training.episode_results import Env
 from armscan.utils.arrays import FloatArray
 from armscan.utils.files import CONFIG_FILE, POLICY_FOLDER
 
-# The run's tag that says whether there is a model of it.
+# Run tag that says whether the run has a model.
 POLICY_TAG = "policy"
 KEPT = "kept"
-# The run's tag with the sum of the model, by which another one in its place is known.
+# Run tag with the SHA-256 of the model, by which a replaced model is detected.
 SUM_TAG = "policy.sha256"
-# How far the model may be from its network, and from the learner and ONNX, which add up in orders of their own.
+# Largest difference of the model from its network; and from the learner and ONNX, which sum in other orders.
 TOLERANCE, ROUNDING_TOLERANCE = 1e-6, 1e-5
-# First seed of the episode that the observations are from, above those of all episodes that count; and how many.
+# First seed of the episodes that the observations come from, above those of evaluations; and number of observations.
 FIRST_SEED, N_OBSERVED = 6 * 10**6, 8
 
 
 def save_policy(agent: Learner, env: Env, tracked: TrackedRun, folder: Path, tell: Callable[[str], None]) -> None:
     """Store the policy of a trained agent as a model of its run, unless its configuration disables it.
 
-    A model that cannot be stored stops no run: the reason is printed, and noted in a tag.
+    If the model cannot be stored, the run goes on: the reason is printed, and noted in a tag.
     """
     config = yaml.safe_load((folder / CONFIG_FILE).read_bytes())
-    # Runs of earlier versions say nothing of it.
+    # Runs of earlier versions do not have the key.
     if not config["tracking"].get("policy", True):
         return
     model = folder / POLICY_FOLDER
     try:
         make_model(agent, env, model, facts_of(config, env, tracked.run_id))
     except ExportError as error:
-        # Another run's, left in a folder that somebody named.
+        # The model of an earlier run in the same folder.
         shutil.rmtree(model, ignore_errors=True)
         tell(f"the policy is not kept as a model: {error}")
         tracked.set_tags({POLICY_TAG: f"not kept: {error}"})
@@ -69,7 +69,7 @@ def make_model(agent: Learner, env: Env, folder: Path, facts: Mapping[str, Any])
     """Write an agent's policy as a model, replacing an earlier one; a model that fails a check is not written.
 
     Raises:
-        ExportError: If the policy cannot be written down, or the model does not answer as the agent does.
+        ExportError: If the policy cannot be exported, or the model does not answer as the agent does.
     """
     policy, played = agent.policy(), _played(agent, env)
     batch = batch_of([observation for observation, _ in played])
@@ -92,7 +92,7 @@ def make_model(agent: Learner, env: Env, folder: Path, facts: Mapping[str, Any])
 
 
 def facts_of(config: Mapping[str, Any], env: Env, run_id: str) -> dict[str, Any]:
-    """Return the metadata of a model: its origin, what it has observed, and the meaning of its actions."""
+    """Return the metadata of a model: its origin, its observations, and the meaning of its actions."""
     rules = config["env"]
     ways: dict[str, Any] = {"tx": "the volume's size across", "ty": "the volume's size along the arm"}
     if rules["translation_bounds_mm"] is not None:
@@ -135,7 +135,7 @@ def _check(folder: Path, policy: Policy, played: list[tuple[Observed, FloatArray
     answers = model.predict(arrays_of(batch))
     _check_same("the model", answers, "its network", policy(batch).numpy(), TOLERANCE)
     if policy.differs is None:
-        # One by one, as the agent was asked: in another batch torch may add up in another order.
+        # One by one, as the agent was asked: torch may sum another batch size in another order.
         alone = np.concatenate([model.predict(arrays_of(batch_of([observation]))) for observation, _ in played])
         _check_same("the model", alone, "the agent", np.stack([action for _, action in played]), ROUNDING_TOLERANCE)
     _check_same("ONNX", onnx_answers(folder / ONNX_FILE, arrays_of(batch)), "the model", answers, ROUNDING_TOLERANCE)
@@ -155,6 +155,6 @@ def onnx_answers(file: Path, arrays: Arrays) -> NDArray[np.float32]:
 
 def _check_same(what: str, given: NDArray[Any], of: str, wanted: NDArray[Any], tolerance: float) -> None:
     furthest = float(np.abs(given - wanted).max())
-    # A NaN is no number that would be near enough.
+    # `not <=`, so that NaN is refused too.
     if not furthest <= tolerance:
         raise ExportError(f"{what} differs from {of} by up to {furthest:.3g}, but {tolerance:g} is allowed")

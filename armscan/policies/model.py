@@ -21,7 +21,7 @@ from armscan.utils.files import sha256
 
 PROGRAM_FILE, ONNX_FILE = "policy.pt2", "policy.onnx"
 CODE = Path(__file__).with_name("pyfunc.py")
-# All that a model consists of, by their places in its folder.
+# All files of a model, relative to its folder.
 FILES = (
     MODEL_FILE,
     f"artifacts/{PROGRAM_FILE}",
@@ -35,9 +35,9 @@ FILES = (
 )
 # Folder of the bytecode that Python writes beside code.
 BYTECODE = "__pycache__"
-# What the code needs; others come with these.
+# Packages that the code requires, besides their own dependencies.
 REQUIREMENTS = ("mlflow", "numpy", "torch")
-# As the model takes them: one array of shape (n, k), or the parts by their names, each of shape (n, ...).
+# Observations as the model takes them: one array of shape (n, k), or the parts by name, each of shape (n, ...).
 Arrays = NDArray[Any] | dict[str, NDArray[Any]]
 
 
@@ -47,9 +47,9 @@ def write_model(folder: Path, policy: Policy, batch: Batch, facts: Mapping[str, 
     Args:
         folder: Folder of the model, which must not exist yet.
         policy: Policy of a learner.
-        batch: Batch of two or more observations, which gives their shapes; two of them stay with the model as its
+        batch: Batch of two or more observations, which gives their shapes; two of them become the model's input
             example.
-        facts: Facts about the policy, as plain values, which stay with the model.
+        facts: Facts about the policy, as plain values; the model's metadata.
 
     Raises:
         ExportError: If torch.export or ONNX cannot take the policy.
@@ -65,7 +65,7 @@ def write_model(folder: Path, policy: Policy, batch: Batch, facts: Mapping[str, 
             artifacts={"program": str(file)},
             signature=infer_signature(arrays_of(batch), arrays_of(policy(batch))),
             input_example=arrays_of(example),
-            # Without the build that is installed here, such as `+cpu`.
+            # Without a local version label, such as `+cpu`.
             pip_requirements=[f"{name}=={metadata.version(name).partition('+')[0]}" for name in REQUIREMENTS],
             metadata=dict(facts),
         )
@@ -73,7 +73,7 @@ def write_model(folder: Path, policy: Policy, batch: Batch, facts: Mapping[str, 
 
 
 def is_model(folder: Path) -> bool:
-    """Return whether a folder is a model that was written here."""
+    """Return whether a folder is a model that `write_model` wrote."""
     try:
         said = yaml.safe_load((folder / MODEL_FILE).read_bytes())
         return "armscan" in said["metadata"]
@@ -82,14 +82,14 @@ def is_model(folder: Path) -> bool:
 
 
 def others_in(folder: Path) -> list[str]:
-    """Return the files in a model's folder that are not part of a model, nor the bytecode that loading it writes."""
+    """Return the files in a model's folder that are neither part of a model nor bytecode, which loading it writes."""
     paths = (path.relative_to(folder) for path in folder.rglob("*"))
     found = {path.as_posix() for path in paths if BYTECODE not in path.parts}
     return sorted(found - {*FILES, *(str(Path(file).parent) for file in FILES)})
 
 
 def model_sha256(folder: Path) -> str:
-    """Return the SHA-256 of a model: of the sums of its files, each with its place, as `sha256sum` writes them."""
+    """Return the SHA-256 of a model: of the lines that `sha256sum` prints for its files."""
     files = [name for name in FILES if (folder / name).is_file()]
     return sha256("".join(f"{sha256((folder / name).read_bytes())}  {name}\n" for name in files).encode())
 

@@ -1,4 +1,4 @@
-"""MLflow model of a policy: a file of its own, kept in the model, that imports nothing of armscan."""
+"""MLflow model of a policy: a stand-alone file, stored in the model, that does not import armscan."""
 
 from typing import Any
 
@@ -34,7 +34,7 @@ class PyfuncPolicy(PythonModel):
 
 
 def _tensor(part: NDArray[Any]) -> torch.Tensor:
-    # Torch warns of memory that may not be written to.
+    # Torch warns of read-only arrays.
     return torch.from_numpy(np.require(part, requirements=["C", "W"]))
 
 

@@ -1,1 +1,1 @@
-"""Reports for people: pages that need no server, and the comparison of any runs."""
+"""HTML reports that need no server, and the comparison of any runs."""

@@ -8,7 +8,7 @@ from plotly import io
 from plotly.colors import qualitative
 from plotly.graph_objs.layout import Template
 
-# One hue for what a chart shows, another for what stands out, grey for the rest; Matplotlib's pictures have them, too.
+# One hue for what a chart shows, another for what stands out, grey for the rest; Matplotlib's charts use them, too.
 BLUE, ORANGE, RED, GREY = "#1f77b4", "#ff7f0e", "#d62728", "#9a9a9a"
 # No rate is below 0 % or above 100 %.
 RATE_AXIS = {"tickformat": ".0%", "autorangeoptions": {"minallowed": -0.03, "maxallowed": 1.03}}
@@ -32,5 +32,5 @@ def look() -> Template:
 
 
 def mode(n_points: int) -> str:
-    """Return how a curve of so many points is drawn: with its points, unless they would hide it."""
+    """Return Plotly's mode for a curve of `n_points`: with markers, unless they would hide it."""
     return "lines+markers" if n_points <= MAX_MARKERS else "lines"

@@ -19,19 +19,19 @@ from armscan.stats.aggregation import MIN_SEEDS
 from armscan.training import MetricEstimates
 from armscan.training.metric_display import is_rate, title_of
 
-# By figure, axis and number of the group.
+# By metric, axis and index of the group.
 Curves = Mapping[tuple[str, str, int], Curve]
 
-# More groups than that would hide each other behind their bands and seeds.
+# More groups would hide each other behind their bands and seeds.
 MANY = 6
 ROW_PX, LEGEND_ROW_PX, GROUP_PX, AROUND_PX, SWITCHES_PX = 250, 22, 34, 110, 84
-# Of the legend, all of it and one letter; and the line beside a name.
+# Widths in the legend: all of it, one letter, and the line beside a name.
 LEGEND_PX, LETTER_PX, SAMPLE_PX = 950, 7, 50
 BANDS, SEEDS = "band", "seed"
-# What is shown beside the thick lines, by the button.
+# Traces shown beside the thick lines, by button.
 SHOWN = {"bands and seeds": (BANDS, SEEDS), "bands": (BANDS,), "neither": ()}
 LABEL_CHARS = 38
-# Beside the leading rate.
+# Final metrics shown beside the leading rate.
 FINAL = ("median_distance_mm", "mean_steps")
 Points = dict[str, list[Any]]
 
@@ -42,7 +42,7 @@ class Trace:
 
     Args:
         kind: One of `BANDS` and `SEEDS`, or empty for a trace of the whole group.
-        look: Plotly's arguments of the line.
+        look: Arguments of the line for Plotly.
         over: Points of the trace over each of `AXES`.
     """
 
@@ -52,7 +52,7 @@ class Trace:
 
 
 def colours(n: int) -> list[str]:
-    """Return a colour for each of some groups."""
+    """Return a colour for each of `n` groups."""
     palette = qualitative.D3 if n <= len(qualitative.D3) else qualitative.Dark24
     return [str(palette[number % len(palette)]) for number in range(n)]
 
@@ -84,7 +84,7 @@ def learning_curves(
         figure.update_yaxes(title=title, row=row, col=1, **(RATE_AXIS if is_rate(name) else {}))
     named: set[str] = set()
     for drawn, trace in zip(figure.data, traces, strict=True):
-        # One line of each group stands in the legend.
+        # The legend has one line for each group.
         drawn.showlegend = "text" in trace.over[0] and drawn.legendgroup not in named
         named |= {drawn.legendgroup} if drawn.showlegend else set()
         drawn.visible = trace.kind in ("", *SHOWN[shown])
@@ -153,7 +153,7 @@ def final_chart(
 
 
 def _traces(of_axes: Sequence[Curve], colour: str, *, is_detailed: bool) -> Iterator[Trace]:
-    """Yield the band, the lines of the seeds, and the line of all of them together."""
+    """Yield the band, the lines of the seeds, and the line of their mean."""
     curve = of_axes[0]
     if curve.n_seeds > 1 and is_detailed:
         if curve.n_seeds >= MIN_SEEDS:

@@ -1,4 +1,4 @@
-"""The comparison of any runs: learning curves, final figures, which is likely to be better, and videos side by side."""
+"""The comparison of any runs: learning curves, final figures, probability of improvement, and videos side by side."""
 
 from __future__ import annotations
 
@@ -52,9 +52,9 @@ HOW_BETTER = (
 )
 
 
-# More groups are compared in a table that is folded.
+# With more groups, the pairwise comparison is folded.
 MANY_PAIRS = 12
-# Of more groups, nobody can tell the bands apart.
+# With more groups, nobody can tell the bands apart.
 MAX_DETAILED = 24
 LEADING = "on-plane rate"
 
@@ -100,7 +100,7 @@ def write_comparison(groups: Sequence[Group], left_out: Sequence[TrackedTraining
 
 
 def _figures(groups: Sequence[Group]) -> list[str]:
-    """Return the names of the figures that can be drawn, those of the validation first."""
+    """Return the names of the metrics that can be drawn, those of the validation first."""
     names = {name for group in groups for training in group.trainings for name in training.series}
     titles = validation_titles(names)
     return [*titles, *sorted(names - titles.keys())]

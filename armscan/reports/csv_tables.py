@@ -19,7 +19,7 @@ def all_numbers(
     reached: Sequence[MetricEstimates | None],
     pairs: Mapping[str, Sequence[Pair]],
 ) -> dict[str, list[Row]]:
-    """Return the tables by the names of their files."""
+    """Return the tables by file name."""
     return {
         "runs": run_rows(groups),
         "curves": list(_curve_rows(groups, curves)),
@@ -31,7 +31,7 @@ def all_numbers(
 
 
 def run_rows(groups: Sequence[Group]) -> list[Row]:
-    """Return a row for each run that counts."""
+    """Return a row for each compared run."""
     return [_run_row(group, training) for group in groups for training in group.trainings]
 
 

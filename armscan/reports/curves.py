@@ -14,7 +14,7 @@ from armscan.stats.aggregation import Band, band_over_seeds
 from armscan.training.metric_display import bounds_of
 from armscan.utils.arrays import FloatArray
 
-# What curves are drawn over, and how a series says it.
+# The horizontal axes of curves, and where a series has their values.
 AXES: dict[str, Callable[[Series], FloatArray]] = {
     "environment steps": lambda series: series.env_steps,
     "seconds of training": lambda series: series.wall_s,
@@ -24,7 +24,7 @@ MAX_POINTS = 200
 
 @dataclass(frozen=True)
 class Curve:
-    """A figure of a group over an axis.
+    """A metric of a group over an axis.
 
     Args:
         places: Positions on the axis, ascending.
@@ -44,10 +44,10 @@ NOTHING = Curve(np.empty(0), Band(*[np.empty(0)] * 3), 0, {})
 
 
 def curve_of(group: Group, figure: str, axis: str) -> Curve | None:
-    """Return the curve of a group over one of `AXES`; None if none of its trainings has measured the figure.
+    """Return the curve of a group over one of `AXES`; None if none of its trainings has measured the metric.
 
-    Between two validations a seed's line is straight. A training that has ended keeps its last value while others of
-    its group continue. If one was cut off, the curve ends there. It begins at the first step that all have measured.
+    Values are interpolated linearly between validations. A training that has ended keeps its last value while others of
+    its group continue. If one was cut off, the curve ends there. It begins where all have measured a value.
     """
     trainings = [training for training in group.trainings if figure in training.series]
     lines = [_line(training.series[figure], axis) for training in trainings]
@@ -58,7 +58,7 @@ def curve_of(group: Group, figure: str, axis: str) -> Curve | None:
     of_seeds: dict[str, list[FloatArray]] = defaultdict(list)
     for training, line in known:
         of_seeds[training.seed or training.run_id].append(np.interp(places, *line))
-    # The folds of a seed are no further seeds.
+    # The folds of a seed count as one seed.
     values, *ends = band_over_seeds(np.array([np.mean(each, axis=0) for each in of_seeds.values()]))
     band = Band(values, *np.clip(ends, *bounds_of(figure)))
     return Curve(places, band, len(of_seeds), {training.label: line for training, line in known})

@@ -13,11 +13,11 @@ from armscan.reports.load import TrackedTraining
 LEFT_OUT = (*NOT_COMPARED, "data.cache_dir", FOLD)
 SEED_IN_NAME = re.compile(r"-seed\d+$")
 MAX_LABEL_CHARS = 72
-# The sections before a key.
+# The sections that precede a key.
 SECTIONS = re.compile(r"[\w.]+\.(?=\w+=)")
-# A number with more digits than a label has place for.
+# A number with more digits than a label has room for.
 LONG_NUMBER = re.compile(r"(?<==)\d+\.\d{5,}(e[-+]?\d+)?")
-# By these an episode is another task, or judged otherwise.
+# Keys that change the task of an episode, or how it is judged.
 RULES = ("projection", "reward", "env.")
 
 
@@ -29,7 +29,7 @@ class Group:
         number: Number of the group, from 1.
         name: Keys and values by which it differs from the other groups.
         label: Number and name, short enough for a legend.
-        trainings: Its trainings, each with another seed, or tested on another fold.
+        trainings: Its trainings, each with its own seed or test fold.
     """
 
     number: int
@@ -56,8 +56,8 @@ class Group:
 def group_trainings(trainings: Sequence[TrackedTraining]) -> tuple[list[Group], list[TrackedTraining]]:
     """Return the groups in the order of their first trainings, and the trainings that are left out.
 
-    Of several trainings with the same configuration and seed only one counts, because the others say nothing new: one
-    that has run to its end if there is any, and of these the last.
+    Of several trainings with the same configuration, seed and fold only one counts, because the others add nothing new:
+    one that has run to its end if there is any, and of these the last one started.
     """
     of_key: dict[tuple[tuple[str, str], ...], list[TrackedTraining]] = {}
     trainings = _with_same_limits(trainings)
@@ -72,7 +72,7 @@ def group_trainings(trainings: Sequence[TrackedTraining]) -> tuple[list[Group], 
 
 
 def _with_same_limits(trainings: Sequence[TrackedTraining]) -> list[TrackedTraining]:
-    """Return trainings whose on-plane rates all have the limits of the first evaluation."""
+    """Return the trainings with the on-plane limits of the first evaluation applied to all of them."""
     limits = next((each.evaluation.on_plane for each in trainings if each.evaluation is not None), ())
     return [
         replace(
@@ -85,7 +85,7 @@ def _with_same_limits(trainings: Sequence[TrackedTraining]) -> list[TrackedTrain
 
 
 def differing_rules(groups: Sequence[Group]) -> list[str]:
-    """Return the keys by which the groups' episodes differ, independent of the agent."""
+    """Return the keys, apart from the agent's, in which the groups' episodes differ."""
     keys = _differing([_compared(group.trainings[0].params) for group in groups])
     return [key for key in keys if key.startswith(RULES)]
 
@@ -107,7 +107,7 @@ def _is_under(key: str, sections: Iterable[str]) -> bool:
 
 
 def _differing(of_groups: Sequence[Mapping[str, str]]) -> list[str]:
-    """Return the keys whose values differ; of several that say the same, because one refers to another, the first."""
+    """Return the keys whose values differ; of several with one name and the same values, as by reference, the first."""
     keys = sorted({key for each in of_groups for key in each}, key=lambda key: (key.count("."), key))
     first: dict[tuple[str, tuple[str | None, ...]], str] = {}
     for key in keys:
@@ -129,7 +129,7 @@ def _names(firsts: Sequence[TrackedTraining]) -> list[str]:
         words = [f"{each}={training.choices.get(each, '?')}" for each in chosen]
         for key in keys:
             section = key.partition(".")[0]
-            # What a choice brings with it is said by its name, but for what its own groups differ by.
+            # The name of a choice implies its values, except for those in which groups with this choice differ.
             alike = [
                 params[other].get(key)
                 for other, each in enumerate(firsts)
@@ -142,13 +142,13 @@ def _names(firsts: Sequence[TrackedTraining]) -> list[str]:
 
 
 def _shortened(name: str) -> str:
-    """Return a name with the last part of each key and four digits of long numbers, cut where it is still long."""
+    """Return a name with the last part of each key and four digits of long numbers, cut if it is still too long."""
     short = LONG_NUMBER.sub(lambda number: f"{float(number[0]):.4g}", SECTIONS.sub("", name))
     return short if len(short) <= MAX_LABEL_CHARS else f"{short[: MAX_LABEL_CHARS - 1]}…"
 
 
 def _distinct(names: Sequence[str]) -> list[str]:
-    """Return names of which those that occur several times have a number."""
+    """Return the names, with a number for those that occur several times."""
     counts, seen, distinct = Counter(names), Counter[str](), []
     for name in names:
         seen[name] += 1

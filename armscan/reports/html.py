@@ -71,25 +71,25 @@ summary {{ cursor: pointer; font-weight: bold; margin: 1rem 0; }}
 {body}
 </body></html>
 """
-# A page that reads itself again, and stays where it was scrolled to.
+# A page with this reloads itself, and keeps its scroll position.
 REFRESH = """<meta http-equiv="refresh" content="{0}"><script>
 addEventListener("beforeunload", () => sessionStorage.setItem("scrolled", scrollY));
 addEventListener("load", () => scrollTo(0, sessionStorage.getItem("scrolled") ?? 0));
 </script>"""
-# By which a report is known.
+# Identifies a report.
 MARK, N_MARK_CHARS = '<meta name="generator" content="armscan">', 200
-# Without what leads elsewhere: a button would offer to upload a chart.
+# Without links to other sites: a button would offer to upload a chart.
 CHART_CONFIG = {"displaylogo": False, "showSendToCloud": False, "plotlyServerURL": "", "responsive": True}
 FITTED = "this.querySelectorAll('.js-plotly-plot').forEach((chart) => Plotly.Plots.resize(chart))"
 # A longer table is folded.
 MAX_ROWS = 25
-# A short text is not broken, such as the ID of a run or how it ended.
+# A short text is not broken, such as the ID of a run or its status.
 MAX_WORD_CHARS = 12
 Row = Mapping[str, Any]
 
 
 class Markup(str):
-    """HTML that a table shows as it is."""
+    """HTML that a table does not escape."""
 
     __slots__ = ()
 
@@ -108,8 +108,8 @@ def write_page(
         folder: Folder that takes `report.html` and the CSV files.
         title: Title of the page.
         parts: Pieces of HTML, from top to bottom.
-        tables: Rows by the names of their files; each row's values by column.
-        refresh_s: Seconds after which a browser reads the page again. Default: None, never.
+        tables: Rows by file name; each row's values by column.
+        refresh_s: Seconds after which a browser reloads the page. Default: None, never.
 
     Returns:
         The HTML file.
@@ -143,7 +143,7 @@ def page(title: str, body: str, *, script: str = "", refresh_s: int | None = Non
         title: Title and first heading.
         body: Pieces of HTML.
         script: JavaScript of the page. Default: none.
-        refresh_s: Seconds after which a browser reads the page again. Default: None, never.
+        refresh_s: Seconds after which a browser reloads the page. Default: None, never.
     """
     head = "" if refresh_s is None else REFRESH.format(refresh_s)
     return PAGE.format(title=html.escape(title), head=head, script=script, body=body)
@@ -158,7 +158,7 @@ def _is_report(file: Path) -> bool:
 
 
 def table(rows: Sequence[Row], *, what: str = "rows", kind: str = "rows") -> str:
-    """Return rows as a table, with the columns that any of them has; a long one is folded.
+    """Return rows as an HTML table, with the columns that any of them has; a long one is folded.
 
     Args:
         rows: Values of each row by column; floats are shown with four digits.
@@ -176,7 +176,7 @@ def table(rows: Sequence[Row], *, what: str = "rows", kind: str = "rows") -> str
 
 
 def folded(summary: str, contents: str) -> str:
-    """Return pieces of HTML below a line that opens them."""
+    """Return pieces of HTML that are hidden below a line that opens them."""
     # A chart drawn while hidden has no width.
     return f'<details ontoggle="{FITTED}"><summary>{html.escape(summary)}</summary>{contents}</details>'
 
@@ -196,7 +196,7 @@ def chart(figure: graph_objects.Figure, *, is_wide: bool = False) -> str:
 
 
 def video_address(contents: bytes) -> str:
-    """Return the address of an animated GIF that lies in the page itself."""
+    """Return the data URL of an animated GIF."""
     return f"data:image/gif;base64,{base64.b64encode(contents).decode()}"
 
 
@@ -205,9 +205,9 @@ def _cell(key: str, value: Any) -> str:
     shown = f"{value:.4g}" if isinstance(value, float) else str(value)
     contents = value if isinstance(value, Markup) else html.escape(shown)
     label = f' data-label="{html.escape(key)}"'
-    # A cell of nothing is not shown on a phone.
     is_word = len(shown) <= MAX_WORD_CHARS and not isinstance(value, Markup)
     kind = " class=number" if is_number else " class=word" if is_word else ""
+    # An empty cell is not shown on a phone.
     return f"<td{kind}{label}>{f'<div>{contents}</div>' if contents else ''}</td>"
 
 

@@ -33,22 +33,22 @@ VALIDATION = {
     "validation/mean_return": "return, mean",
 }
 OF_VALIDATION = "validation/"
-# The beginnings of what else is drawn.
+# Prefixes of the other metrics that are drawn.
 OF_THE_TRAINING = ("update/", "train/return", "train/length", "speed/")
 BUDGET = "training.env_steps"
-# MLflow's parameter of what is not set.
+# MLflow's value of a parameter that is not set.
 UNSET = "None"
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class Series:
-    """Course of a figure, one value for each epoch.
+    """A metric over training, with one value for each epoch.
 
     Args:
         env_steps: Environment steps at the end of each epoch, ascending, shape (epochs,).
         wall_s: Seconds of training until then; NaN if not known.
-        values: Values of the figure.
+        values: Values of the metric, shape (epochs,).
     """
 
     env_steps: FloatArray
@@ -63,12 +63,12 @@ class TrackedTraining:
     Args:
         run_id: MLflow run ID.
         name: Name of the run.
-        status: Status of the run, in small letters; `pruned` if its trial was.
-        started_ms: Time of its start, in ms since 1970.
+        status: Status of the run, in lower case; `pruned` if its trial was.
+        started_ms: Start time, in ms since 1970.
         is_whole: Whether it has run to its end: not pruned, failed or still running.
-        params: Its configuration, leaves by dotted keys.
+        params: Its configuration, by dotted keys.
         choices: Choice of each configuration group.
-        series: Curves by the name of the figure.
+        series: Curves by the name of the metric.
         evaluation: Final evaluation on the test volumes; None if it has kept none.
         baselines: Episodes of the baselines on the test volumes, by their names. Default: none, as in older runs.
         volumes: Fingerprints of its test volumes by name; None if it has kept none.
@@ -131,7 +131,7 @@ class TrackedTraining:
 
 
 def validation_titles(names: Iterable[str]) -> dict[str, str]:
-    """Return the titles of those figures that are of the validation, the on-plane rates first."""
+    """Return the titles of those metrics that are of the validation, the on-plane rates first."""
     known = set(names)
     rates = limits_among(name.removeprefix(OF_VALIDATION) for name in sorted(known) if name.startswith(OF_VALIDATION))
     titles = {f"{OF_VALIDATION}{limits.metric}": limits.title for limits in rates}
@@ -139,15 +139,15 @@ def validation_titles(names: Iterable[str]) -> dict[str, str]:
 
 
 def read_trainings(store: TrackingStore, found: Sequence[SelectedRuns], folder: Path) -> list[TrackedTraining]:
-    """Return the trainings that runs describe.
+    """Load the trainings of runs.
 
     Args:
-        store: Store that they are in.
-        found: The runs.
-        folder: Folder that takes their files.
+        store: Store of the runs.
+        found: Runs to load.
+        folder: Folder that their files are downloaded to.
 
     Raises:
-        TrackingError: If a file of them is damaged, or the store cannot be used.
+        TrackingError: If one of their files is damaged, or the store cannot be used.
     """
     runs = [each.run for each in found]
     with store_errors(store.uri):
@@ -183,7 +183,7 @@ def _training(found: SelectedRuns, histories: Mapping[str, History], files: Mapp
 
 
 def _wanted(run: Run) -> list[str]:
-    """Return the names of the metrics of a run that a comparison draws, and of those that it draws them over."""
+    """Return the names of the metrics of a run that a comparison draws, those of the horizontal axes included."""
     shown = {WALL, *VALIDATION, f"{OF_VALIDATION}{leading_of(migrate(run.data.params)).metric}"}
     return [name for name in run.data.metrics if name in shown or name.startswith(OF_THE_TRAINING)]
 
@@ -201,7 +201,7 @@ def _series(histories: Mapping[str, History]) -> dict[str, Series]:
 
 
 def _files(store: TrackingStore, run: Run, folder: Path) -> dict[str, bytes]:
-    """Return the files that a run has kept of those that a comparison needs."""
+    """Return the contents of those files that a comparison needs and the run has kept."""
     folder.mkdir(parents=True)
     # `MlflowClient.download_artifacts` reads the run again for each file.
     repository: Any = get_artifact_repository(run.info.artifact_uri, tracking_uri=store.mlflow.tracking_uri)

@@ -9,7 +9,7 @@ from armscan.reports.groups import Group, differing_rules
 from armscan.reports.load import TrackedTraining
 from armscan.stats.aggregation import MIN_SEEDS
 
-# With as many seeds or more, the intervals of final figures are nearly as wide as they should be.
+# From this number of seeds on, the intervals of final figures are nearly as wide as they should be.
 MANY_SEEDS = 5
 
 
@@ -62,7 +62,7 @@ def _on_missing(groups: Sequence[Group]) -> Iterator[str]:
     of_files: dict[str, list[str]] = {}
     for group in groups:
         for training in group.trainings:
-            # Of others it is said that they have not run to their end.
+            # Unfinished ones have a note of their own.
             for file in training.missing if training.is_whole else ():
                 of_files.setdefault(file, []).append(_named(group, training))
     for file, which in of_files.items():

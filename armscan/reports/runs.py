@@ -1,4 +1,4 @@
-"""Runs by their ids, compared."""
+"""Compare runs by their IDs."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from armscan.tracking import open_existing_store
 from armscan.utils.files import ID_CHARS
 
 REPORTS = Path("reports")
-# A folder of more runs than fit is named by a sum of them.
+# A longer folder name is replaced by its hash.
 MAX_NAME_CHARS, SUM_CHARS = 60, 12
 
 
 def compare_runs(text: str, uri: str, out: str | None) -> Path:
-    """Write the report of runs.
+    """Write a report that compares runs.
 
     Args:
         text: Names of the runs; see `read_runs`.
@@ -31,13 +31,13 @@ def compare_runs(text: str, uri: str, out: str | None) -> Path:
 
     Raises:
         InvalidValueError: If one of the names is empty.
-        TrackingError: If one of them is not found, is none to be compared, or has kept something damaged.
+        TrackingError: If one of them is not found, cannot be compared, or has a damaged file.
     """
     named = read_runs(text)
     os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
     store = open_existing_store(uri)
     found = find_trainings(store, named)
-    # Deferred: runs that are not there are answered before these are loaded.
+    # Deferred: missing runs are reported before these are loaded.
     from armscan.reports.comparison import write_comparison
     from armscan.reports.groups import group_trainings
     from armscan.reports.load import read_trainings

@@ -13,7 +13,7 @@ from armscan.tracking.run import MAX_DEPTH
 from armscan.tracking.store import store_errors
 from armscan.tracking.tags import AGENT_TAG, EVALUATED_TAG, JOB_TAG, PARENT_TAG, PRUNED_TAG, TRIAL_TAG
 
-# How a whole experiment of MLflow is named, instead of runs.
+# Prefix that names a whole experiment of MLflow instead of a run.
 EXPERIMENT = "experiment:"
 N_SHOWN = 6
 
@@ -53,7 +53,7 @@ def find_trainings(store: TrackingStore, named: Sequence[str]) -> list[SelectedR
         named: IDs, or their first characters, of trainings or of their parents, or whole experiments; see `read_runs`.
 
     Raises:
-        TrackingError: If one of them is not found, is an evaluation, or there is no training in it.
+        TrackingError: If one of them is not found, is an evaluation, or contains no training.
     """
     found: dict[str, Run] = {}
     with store_errors(store.uri):
@@ -84,7 +84,7 @@ def _below(store: TrackingStore, run: Run, depth: int = 0) -> Iterator[Run]:
     if AGENT_TAG in run.data.tags or depth > MAX_DEPTH:
         return
     children = store.children(run.info.experiment_id, run.info.run_id)
-    # Jobs of a grid start side by side: by their numbers, so that they stand as the grid's own table has them.
+    # Jobs of a grid start in parallel: sorted by number, they are in the order of the grid's own table.
     numbers = {child.info.run_id: child.data.tags.get(JOB_TAG, "") for child in children}
     for child in sorted(children, key=lambda each: (len(numbers[each.info.run_id]), numbers[each.info.run_id])):
         yield from _below(store, child, depth + 1)
@@ -104,7 +104,7 @@ def _in_experiment(store: TrackingStore, name: str) -> list[Run]:
 
 
 def _selected(store: TrackingStore, runs: Sequence[Run]) -> list[SelectedRuns]:
-    """Return trainings with whether their trials were pruned."""
+    """Return the trainings, each with whether its trial was pruned."""
     for run in runs:
         check_version(run)
     trials = {

@@ -19,7 +19,7 @@ from armscan.training.baselines import RANDOM
 from armscan.training.headline import beside_random
 from armscan.utils.arrays import FloatArray
 
-# Rate of the leading limits, and metrics of `Evaluation.metrics`, that groups are compared by; true where higher is
+# Metrics that groups are compared by: the leading on-plane rate, and others of `Evaluation.metrics`; true if higher is
 # better.
 COMPARED_BY = {"on_plane_rate": True, "median_distance_mm": False, "success_rate": True, "mean_steps": False}
 
@@ -87,17 +87,17 @@ def metrics_by_volume(training: TrackedTraining) -> dict[str, dict[str, float]]:
 
 
 def baseline_metrics(groups: Sequence[Group]) -> list[dict[str, MetricEstimates]]:
-    """Return the metrics of the baselines on the test volumes of each group, by their names.
+    """Return the metrics of the baselines, by name, on the test volumes of each group.
 
-    The baselines are not trained, and play the same episodes for every seed; so do those of groups that were evaluated
-    on the same volumes by the same rules.
+    The baselines are not trained, and play the same episodes for every seed, and for all groups that were evaluated on
+    the same volumes by the same rules.
     """
     metrics = cache(MetricEstimates.of)
     return [{name: metrics(Evaluation.pooled(each)) for name, each in _baselines(group).items()} for group in groups]
 
 
 def _baselines(group: Group) -> dict[str, list[Evaluation]]:
-    """Return the baselines' evaluations, of each fold once, by their names."""
+    """Return the baselines' evaluations by name, one for each fold."""
     of_fold = {each.fold: each.baselines for each in reversed(group.trainings) if each.baselines}
     names = dict.fromkeys(name for baselines in of_fold.values() for name in baselines)
     return {name: [each[name] for each in of_fold.values() if name in each] for name in names}

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from armscan.reports.groups import Group
 from armscan.reports.load import TrackedTraining
 
-# An animated picture starts when first shown, and all images with its address share it: each start has new addresses.
+# A GIF starts when it is first shown, and all images with its address share it: each start needs new addresses.
 PROGRAM = """
 <script>
 (() => {
@@ -29,7 +29,7 @@ PROGRAM = """
 
 
 def videos(groups: Sequence[Group]) -> str:
-    """Return a video of each group that has one, of its median training."""
+    """Return the section with a video of each group's median training, for groups that have videos."""
     chosen = [(group, training) for group in groups if (training := _median(group)) is not None]
     if not chosen:
         return "<h2>Episodes</h2><p>None of these runs has kept a video.</p>"
@@ -42,7 +42,7 @@ def videos(groups: Sequence[Group]) -> str:
 
 
 def _median(group: Group) -> TrackedTraining | None:
-    """Return the training in the middle of those with a video; one that was not judged only if none was."""
+    """Return the median training, by mean steps, of those with a video; one without an evaluation only if all are."""
     recorded = [training for training in group.trainings if training.video is not None]
     ranked = sorted((each for each in recorded if each.evaluation), key=_mean_steps) or recorded
     return ranked[(len(ranked) - 1) // 2] if ranked else None

@@ -1,1 +1,1 @@
-"""The runs of a tracking store: list, show, prune, reproduce; policies exported and registered."""
+"""The runs of a tracking store: list, show, prune and reproduce them; export and register policies."""

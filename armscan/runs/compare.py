@@ -1,4 +1,4 @@
-"""Comparison of two runs, point by point, over all metrics of learning."""
+"""Comparison of the metrics of two runs, point by point."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from armscan.tracking.client import TrackingStore
 from armscan.tracking.histories import metric_histories
 from armscan.tracking.system_metrics import PREFIX
 
-# Metrics of the clock and the machine, which are never the same twice, begin so.
+# Prefixes of metrics of time and machine, which differ from run to run.
 TIMES = (PREFIX, "speed/", "wall_s", "training_s")
 N_SHOWN = 10
 
@@ -94,7 +94,7 @@ class Comparison:
 
 
 def compare_runs(store: TrackingStore, first_id: str, second_id: str) -> Comparison:
-    """Compare the metrics of two runs of a store, the earlier one first, but for those of time and machine."""
+    """Compare all metrics of two runs of a store, except those of time and machine; the original run comes first."""
     names = {
         run_id: [name for name in store.get_run(run_id).data.metrics if not name.startswith(TIMES)]
         for run_id in (first_id, second_id)
@@ -110,7 +110,7 @@ def difference(metric: str, then: Mapping[int, float], now: Mapping[int, float])
     n_missing, n_new = len(then.keys() - now.keys()), len(now.keys() - then.keys())
     if not common:
         return Difference(metric, 0, n_missing, n_new)
-    # Two that are the same differ by nothing, also where they are infinite.
+    # The difference of two equal infinities would be NaN.
     sizes = {step: 0.0 if then[step] == now[step] else abs(then[step] - now[step]) for step in common}
     at = max(common, key=lambda step: sizes[step])
     return Difference(metric, len(common), n_missing, n_new, sizes[at], at, then[at], now[at])

@@ -17,7 +17,7 @@ from armscan.tracking.tags import EVALUATED_TAG
 from armscan.training import ON_PLANE, TEST, Evaluation, ResultTable
 from armscan.utils.files import BASELINES_FILE, EVALUATION_FILE
 
-# What MLflow's databases take of a description.
+# Longest description that MLflow's databases accept.
 MAX_CHARS = 5000
 OWN_VOLUMES = "own volumes"
 TAGGED = (
@@ -32,7 +32,7 @@ class Card:
 
     Args:
         text: Text of the card, in Markdown.
-        tags: Figures by their names.
+        tags: Metrics by name, for the version's tags.
     """
 
     text: str
@@ -40,11 +40,11 @@ class Card:
 
     @classmethod
     def of(cls, run: FoundRun, folder: Path) -> Self:
-        """Return the card of a run's policy, of its own evaluation and the latest by `armscan evaluate` with a JSON.
+        """Return the card of a run's policy, from its own evaluation and the latest `armscan evaluate` with a JSON.
 
         Args:
             run: Run to describe.
-            folder: Folder that takes the files.
+            folder: Folder for the downloaded files.
 
         Raises:
             TrackingError: If an evaluation cannot be read.
@@ -57,10 +57,10 @@ class Card:
         tags: dict[str, str] = {}
         for title, report in reports.items():
             section = f"\n\n### {title}\n\n{_table(report).markdown()}"
-            # Where there is no room for both, the run's own evaluation stays.
+            # If there is no room for both, the run's own evaluation stays.
             if len(text + section) <= MAX_CHARS:
                 text += section
-            # The run's own evaluation is first, by its own rules.
+            # The run's own evaluation takes precedence: it was played by the run's rules.
             tags = _tags(report) | tags
         return cls(text, tags)
 
@@ -78,7 +78,7 @@ def _reports(run: FoundRun, folder: Path) -> dict[str, EvaluationReport]:
 
 
 def _latest(run: FoundRun) -> tuple[str, str] | None:
-    """Return the latest evaluation of a run that has kept its JSON: the id of its own run, and the file."""
+    """Return the latest evaluation of a run that kept its JSON: the MLflow run ID of the evaluation, and the file."""
     found = run.client.search_runs(
         [run.experiment_id],
         f"tags.`{EVALUATED_TAG}` = '{run.run_id}' and attributes.status = 'FINISHED'",
@@ -115,7 +115,7 @@ def _read(run: FoundRun, run_id: str, file: str, folder: Path) -> EvaluationRepo
 
 
 def _own_baselines(run: FoundRun, folder: Path) -> dict[str, dict[str, Evaluation]]:
-    """Return the baselines that a run has kept, on its test volumes; none of older runs."""
+    """Return the baselines that a run has kept, on its test volumes; none for older runs."""
     if BASELINES_FILE not in run.files:
         return {}
     contents = _json(run, run.run_id, BASELINES_FILE, folder)

@@ -27,9 +27,9 @@ from armscan.training import TEST
 from armscan.utils.files import POLICY_FOLDER
 
 MAX_NAME_CHARS = 256
-# The alias of the version that was registered last, `models:/NAME@champion`.
+# The alias of the latest version: `models:/NAME@champion`.
 CHAMPION = "champion"
-# The tag of a version that names the model of MLflow of the same checkpoint.
+# The tag of a version that names MLflow's logged model of the same checkpoint.
 MODEL_TAG = "logged_model"
 # A policy computes its most likely action in 32 bits on the CPU, however the run trained and evaluated it.
 PLAIN_COMPUTE = {"device": "cpu", "precision": "float32", "compile": False}
@@ -49,7 +49,6 @@ def export_policy(tracking: str, run_id: str, folder: Path, *, trust: bool = Fal
     """
     source = agent_of_run(tracking, run_id, {}, trust=trust)
     assert source.run is not None
-    # A policy answers as the agent was evaluated: with its most likely action, on the CPU.
     source.config.compute.update(PLAIN_COMPUTE)
     if "deterministic_eval" in source.config.agent:
         source.config.agent.deterministic_eval = True

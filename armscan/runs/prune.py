@@ -31,7 +31,7 @@ class PruneItem:
     Args:
         run: Run whose files would be removed.
         n_bytes: Disk space that their removal frees, in bytes.
-        left: Reason why they stay; None if they do not.
+        left: Reason why they stay; None if they are to be removed.
     """
 
     run: Run
@@ -60,10 +60,10 @@ def remove(client: TrackingStore, item: PruneItem, what: str) -> str | None:
     """Remove the files of a run that a plan names.
 
     Returns:
-        Why the folder stays; None if it is gone, or was to stay.
+        Reason why the folder is still there; None if it is gone, or only checkpoints were to be removed.
 
     Raises:
-        RunSkippedError: If the files must be left as they are now; nothing has been touched.
+        RunSkippedError: If the files must now be kept; nothing has been removed.
         OSError: If a file cannot be removed.
     """
     run_id, parent_id = item.run.info.run_id, item.run.data.tags.get(PARENT_TAG, "")
@@ -94,7 +94,7 @@ def remove_planned(client: TrackingStore, items: Sequence[PruneItem], what: str)
             note = remove(client, item, what)
         except RunSkippedError as error:
             print(f"{run_id} stays: {error}")
-        # What fails for one run must not keep the others.
+        # A failure for one run must not stop the others.
         except Exception as error:
             n_failed += 1
             reason = f"{error.filename}: {error.strerror}" if isinstance(error, PermissionError) else reason_in(error)

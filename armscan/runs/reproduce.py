@@ -26,9 +26,9 @@ from armscan.tracking.tags import CHOICE, EVALUATED_TAG
 from armscan.training import check_unchanged
 from armscan.utils.files import DIFF_FILE, ENVIRONMENT_FILE, REPRODUCTION_FILE, folder_lock
 
-# Of a run that was made again: which one it is of, and whether the same came of it.
+# Tags of a reproduction: the original run, and whether all metrics are the same.
 OF_TAG, SAME_TAG = "reproduction.of", "reproduction.is_same"
-# Packages that are named of those whose versions seldom matter.
+# Number of differing packages to name, of those whose versions seldom matter.
 N_SHOWN = 8
 
 
@@ -53,8 +53,8 @@ def load_original(tracking: str, run_id: str, *, trust: bool = False) -> Origina
     """Return a tracked run, ready to be reproduced.
 
     Raises:
-        ArmscanError: If there is no such run, it is none of `armscan run`, it has not ended, what it has kept is gone
-            or was changed, or its volumes are not those any more that it was started with.
+        ArmscanError: If there is no such run, it was not made by `armscan run`, it has not ended, its files are missing
+            or changed, or its volumes have changed since it was started.
     """
     run = load_run(tracking, run_id)
     if EVALUATED_TAG in run.tags:
@@ -100,7 +100,7 @@ def differences(original: Original) -> list[str]:
     before, here = original.environment, environment()
     machine = [key for key in ("python", "platform", "machine") if before.get(key) != here[key]]
     lines += [f"{key} was {before.get(key)}, and is {here[key]}" for key in machine]
-    # This project's own version says nothing that the commit does not.
+    # armscan's own version adds nothing to the commit.
     packages = sorted((before["packages"].keys() | here["packages"].keys()) - {"armscan"})
     pairs = {name: [each["packages"].get(name, "not installed") for each in (before, here)] for name in packages}
     changed = {name: f"{name} was {then}, and is {now}" for name, (then, now) in pairs.items() if then != now}
@@ -126,7 +126,7 @@ def reproduce(original: Original, folder: Path, differing: Sequence[str]) -> Com
         differing: Differences that `differences` found; kept with the new run.
 
     Returns:
-        All metrics but those of time and machine, compared.
+        The comparison of all metrics, except those of time and machine.
     """
     run = original.run
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):

@@ -21,7 +21,7 @@ from armscan.tracking.run import MAX_DEPTH
 from armscan.tracking.sync import ENDED
 from armscan.tracking.tags import PARENT_TAG
 
-# What rows are sorted by.
+# Attributes of a row by sort key.
 SORTS = {
     "started": "started",
     "duration": "duration_s",
@@ -33,7 +33,7 @@ SORTS = {
 
 
 def artifacts_of(client: TrackingStore, run: Run) -> dict[str, int] | None:
-    """Return the bytes of each artifact of a run by its path; None if their store does not tell."""
+    """Return the bytes of each artifact of a run by its path; None if their store cannot be read."""
 
     def listed(path: str | None) -> Iterator[tuple[str, int]]:
         for each in repository.list_artifacts(path):
@@ -45,7 +45,7 @@ def artifacts_of(client: TrackingStore, run: Run) -> dict[str, int] | None:
     try:
         repository = get_artifact_repository(run.info.artifact_uri, tracking_uri=client.mlflow.tracking_uri)
         return dict(listed(None))
-    # What is there is not lost because nobody can say how much it is.
+    # The run is listed all the same, with an unknown size.
     except (MlflowException, RequestException, OSError):
         return None
 
@@ -75,7 +75,7 @@ class RunRow:
 
     @cached_property
     def in_folder(self) -> int:
-        """Bytes of its own files in its folder on this machine."""
+        """Bytes of its own files in its folder on this machine, and of those folded into it."""
         n_bytes = sum(child.in_folder for child in self.children) if self.is_folded else 0
         with contextlib.suppress(RunSkippedError):
             n_bytes += sum(OwnFolder.of(self.run).files().values())
@@ -83,7 +83,7 @@ class RunRow:
 
     @cached_property
     def in_store(self) -> int | None:
-        """Bytes of its artifacts; None if a store does not tell."""
+        """Bytes of its artifacts, and of those folded into it; None if a store cannot be read."""
         artifacts = artifacts_of(self.client, self.run)
         parts = [None if artifacts is None else sum(artifacts.values())]
         parts += [child.in_store for child in self.children if self.is_folded]
@@ -103,13 +103,13 @@ class RunRow:
     @property
     def duration_s(self) -> float | None:
         """Duration in seconds; None if it has not ended."""
-        # MLflow keeps the end of a run that goes on again.
+        # MLflow keeps the end time of a run that was resumed.
         end = self.run.info.end_time if self.run.info.status in ENDED else None
         return None if end is None else (end - self.run.info.start_time) / 1000
 
     @property
     def on_plane(self) -> OnPlane:
-        """Leading limits of its on-plane rates, as its configuration says; those by default for older runs."""
+        """Leading limits of its on-plane rates, from its configuration; the default ones for older runs."""
         return leading_of(self.run.data.params)
 
     @property
@@ -135,9 +135,9 @@ class RunRow:
 
 
 def collapse(client: TrackingStore, runs: Sequence[Run]) -> list[RunRow]:
-    """Return rows of the runs whose parent is not among them, the others folded into them.
+    """Return a row for each run whose parent is not among the runs; the others are folded into these rows.
 
-    Runs too deep below others have rows of their own, as have runs that are their own ancestors.
+    Runs that are nested too deeply, or are their own ancestors, also have rows of their own.
     """
     parents = {run.info.run_id: run.data.tags.get(PARENT_TAG, "") for run in runs}
 
@@ -160,7 +160,7 @@ def collapse(client: TrackingStore, runs: Sequence[Run]) -> list[RunRow]:
 
 def sort_rows(rows: Sequence[RunRow], sort: str, limit: int | None = None) -> list[RunRow]:
     """Return rows by one of `SORTS`, the greatest first with - before it; those without a value always come last."""
-    # A server is asked for each run's size: once.
+    # Read once: a size is a request to the server.
     values = [(getattr(row, SORTS[sort.removeprefix("-")]), row) for row in rows]
     known = [each for each in values if each[0] is not None]
     known.sort(key=lambda each: each[0], reverse=sort.startswith("-"))

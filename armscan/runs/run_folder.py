@@ -73,7 +73,7 @@ class OwnFolder:
         return cls(path, run.info.run_id)
 
     def files(self) -> dict[Path, int]:
-        """Return the run's own files with their sizes in bytes; those that prove ownership or hold it come last."""
+        """Return the run's own files with their sizes in bytes; last, those that prove ownership or lock the folder."""
         last = [CONFIG_FILE, *(f"{OUTBOX_FOLDER}/{self.run_id}{end}" for end in (DELIVERED, SUFFIX, LOCK)), LOCK_FILE]
         unfinished = [file.name for file in self.path.glob(f".*.{UNFINISHED}")]
         names = [*unfinished, *RESULTS, *STARTED_WITH, *RECORDS, *self._tracked(), *HYDRA_FILES]
@@ -82,7 +82,7 @@ class OwnFolder:
             file = self.path / name
             with contextlib.suppress(OSError):
                 status = file.lstat()
-                # Nothing that leads out of the folder.
+                # No links, which may lead out of the folder.
                 if stat.S_ISREG(status.st_mode) and file.parent.resolve().is_relative_to(self.path):
                     found[file] = status.st_size
         return found
@@ -99,10 +99,11 @@ class OwnFolder:
         """Return a context in which no other process works in the folder or delivers from it.
 
         Args:
-            is_planned: Whether the removal is only planned: a folder that was never locked is not locked then.
+            is_planned: Whether the removal is only planned; a folder without lock files is not locked then. Default:
+                False.
 
         Raises:
-            RunSkippedError: If another process is at work there, or something is not delivered.
+            RunSkippedError: If another process is using it, or something is not uploaded yet.
         """
         outbox = file_of(self.path, self.run_id)
         with contextlib.ExitStack() as stack:
@@ -130,7 +131,7 @@ class OwnFolder:
         model = self.path / POLICY_FOLDER
         inner = [] if model.is_symlink() else [Path(where) for where, _, _ in os.walk(model, topdown=False)]
         for folder in (*inner, self.path / HYDRA_FOLDER, self.path / OUTBOX_FOLDER, self.path):
-            # Somebody's files are in it, or their own feet.
+            # It may contain other files, or be the working folder.
             with contextlib.suppress(OSError):
                 if not Path.cwd().is_relative_to(folder):
                     folder.rmdir()

@@ -21,7 +21,7 @@ from armscan.tracking.tags import EVALUATED_TAG, FAILURE_TAG, PARENT_TAG
 from armscan.utils.console import wide_console
 from armscan.utils.files import BEST_CHECKPOINT, ID_CHARS, LAST_CHECKPOINT
 
-# How a run was started, as far as it has kept it; the first that is there is shown.
+# Tags that say how a run was started; the first one that it has is shown.
 STARTED_BY = ("command", "overrides")
 MAX_VALUE_CHARS = 200
 

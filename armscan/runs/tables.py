@@ -24,12 +24,12 @@ from armscan.utils.files import ID_CHARS
 from armscan.utils.rate_text import PERCENT, formatted
 
 MISSING = "-"
-# Of a name, which a multirun's words may be.
+# Longest name to show; that of a multirun is its command line.
 MAX_NAME_CHARS = 80
 
 
 def format_duration(seconds: float | None) -> str:
-    """Return a time as a person reads it: 1:05:10, 3d 4h."""
+    """Format a duration, such as 1:05:10 or 3d 4h."""
     if seconds is None:
         return MISSING
     minutes, rest = divmod(round(seconds), 60)
@@ -61,7 +61,7 @@ def write_rows(rows: Sequence[RunRow], form: str) -> None:
 def _print_table(rows: Sequence[RunRow]) -> None:
     """Print runs as a table; where names do not fit, each stands in a line above its run."""
     limits = {row.on_plane for row in rows if row.on_plane_rate is not None} or {ON_PLANE[0]}
-    # In lines of its own: names need the columns.
+    # A heading of several lines keeps the column narrow.
     plane = "on\nplane" + (",\n{:g} mm\n{:g}°".format(*min(limits)) if len(limits) == 1 else "")
     right = [Column(name, justify="right") for name in ("took", plane, "success", "steps,\nmean", "size", "below")]
     cells = []
@@ -93,7 +93,7 @@ def shortened(name: str) -> str:
 
 
 def narrow_table(*headings: str) -> Table:
-    """Return a table without lines; a heading with > at its end is of numbers."""
+    """Return a table without rules; a heading that ends in > is of numbers."""
     table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False)
     for heading in headings:
         is_name = heading in ("name", "")

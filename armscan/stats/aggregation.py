@@ -1,7 +1,7 @@
 """Aggregate trainings with several seeds: bands of curves, and how likely one group is better than another.
 
-Agarwal et al. 2021 (arXiv:2108.13264) recommend both figures, with intervals by bootstraps of the seeds. With fewer
-than ten seeds these are too narrow, so the intervals here are Student's and Newcombe's.
+Agarwal et al. 2021 (arXiv:2108.13264) recommend both figures, with intervals that bootstrap the seeds. With fewer than
+ten seeds these are too narrow, so the intervals here are Student's and Newcombe's.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from armscan.utils.arrays import FloatArray
 
 # With fewer seeds a band would be wider than a chart.
 MIN_SEEDS = 3
-# Steps of a bisection from 0 to 1, to the last digit of a number.
+# Steps of a bisection from 0 to 1, to the last bit.
 N_HALVINGS = 53
 # Quantile at the upper end of an interval.
 UPPER = (1 + LEVEL) / 2
@@ -50,20 +50,20 @@ def band_over_seeds(scores: FloatArray) -> Band:
 def probability_of_improvement(ours: FloatArray, theirs: FloatArray) -> Estimate:
     """Return how likely a training of ours is better than one of theirs on the same volume, averaged over the volumes.
 
-    The share of pairs of seeds in which ours is greater, where ties count half: the statistic of Mann and Whitney. The
-    interval holds the probabilities from which the estimate is no further than chance explains, with the variance that
-    this statistic would have there: method 5 of Newcombe 2006, doi:10.1002/sim.2324. It is wide enough for few seeds,
-    and wide for two, because the mean over several volumes varies less than that.
+    The share of pairs of seeds in which ours is greater, where ties count half: the Mann-Whitney statistic. The
+    interval holds every probability from which the estimate is no further than chance explains, given the variance that
+    the statistic has at that probability: method 5 of Newcombe 2006, doi:10.1002/sim.2324. It is wide enough for few
+    seeds, and wide for two, because the mean over several volumes varies less than this variance.
 
     Args:
         ours: Our scores, shape (seeds, volumes), greater is better, all finite.
         theirs: Their scores, shape (seeds, the same volumes).
 
     Returns:
-        The estimate, without an interval where either has one seed.
+        The estimate, without an interval if either has one seed.
 
     Raises:
-        InvalidValueError: If the volumes are not as many.
+        InvalidValueError: If the numbers of volumes differ.
     """
     return probabilities_of_improvement([(ours, theirs)])[0]
 
@@ -78,7 +78,7 @@ def probabilities_of_improvement(pairs: Sequence[tuple[FloatArray, FloatArray]])
 
 
 def _furthest(values: FloatArray, end: float, n_seeds: FloatArray) -> FloatArray:
-    """Return the probability closest to `end` that explains each estimate; `n_seeds` has a row of two for each."""
+    """Return the probability closest to `end` that explains each estimate; `n_seeds` has shape (estimates, 2)."""
     from scipy.special import ndtri
 
     inside, outside = values, np.full_like(values, end)
@@ -92,7 +92,7 @@ def _furthest(values: FloatArray, end: float, n_seeds: FloatArray) -> FloatArray
 
 
 def _wins(ours: FloatArray, theirs: FloatArray) -> FloatArray:
-    """Return how often a seed of ours is better, by volume, shape (our seeds, their seeds); a tie is half a win."""
+    """Return how often ours is better over the volumes, shape (our seeds, their seeds); a tie is half a win."""
     if ours.shape[1:] != theirs.shape[1:]:
         raise InvalidValueError(
             f"scores are of {ours.shape[1]} and of {theirs.shape[1]} volumes, but they must be of the same ones"

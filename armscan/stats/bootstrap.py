@@ -1,7 +1,7 @@
-"""Percentile bootstrap intervals of episodes that come from volumes.
+"""Percentile bootstrap intervals of episodes that are grouped by volume.
 
 An interval is for *other* volumes, and episodes on one volume are alike. So a resample draws volumes with replacement,
-then as many episodes of each drawn volume as it has, with replacement too. With one volume this is a bootstrap of its
+then as many episodes of each drawn volume as it has, also with replacement. With one volume this is a bootstrap of its
 episodes, and describes that volume only. With several *seeds* of a training, a resample draws the seeds first; all
 drawn seeds share the drawn volumes, as all seeds were evaluated on the same volumes.
 
@@ -26,14 +26,14 @@ from armscan.utils.arrays import FloatArray
 
 LEVEL = 0.95
 N_RESAMPLES = 2000
-# Resampled values that are in memory at once.
+# Most resampled values in memory at once.
 MAX_VALUES = 2_000_000
 
 Statistic = Callable[[FloatArray], FloatArray]
 
 
 class Estimate(NamedTuple):
-    """A figure, and the interval that it lies in at 95 % confidence; all NaN if nothing was measured."""
+    """A figure with its 95 % confidence interval; all NaN if nothing was measured."""
 
     value: float
     low: float
@@ -46,7 +46,7 @@ class Estimate(NamedTuple):
 
 
 def mean(samples: FloatArray) -> FloatArray:
-    """Return the mean over the last axis, ignoring NaN; NaN: all values are NaN."""
+    """Return the mean over the last axis, ignoring NaN; NaN if all values are NaN."""
     is_known = ~np.isnan(samples)
     if is_known.all():
         return np.asarray(samples.mean(axis=-1))
@@ -93,7 +93,7 @@ def estimates(
     """Return figures with their intervals, by name; all of them from the same resamples.
 
     Args:
-        columns: Statistic and values of each figure, by its name; a value for each episode, NaN for those left out.
+        columns: Statistic and values of each figure, by its name; one value for each episode, NaN to leave it out.
         volumes: Volume of each episode.
         trainings: Training of each episode; None if all are from one.
         seed: Seed of the resampling; the same seed gives the same intervals.
@@ -109,7 +109,7 @@ def estimates(
     resampled: dict[str, list[FloatArray]] = {name: [] for name in columns}
     for places in _resamples(trainings, volumes, np.random.default_rng(seed)):
         for name, (statistic, _) in columns.items():
-            # The place after the last, which is also that before the first, holds what is nobody's.
+            # Index -1, an unused place, reads the NaN that is appended here.
             resampled[name].append(statistic(np.append(arrays[name], np.nan)[places]))
     return {
         name: _estimate(float(statistic(arrays[name])), np.concatenate(resampled[name]))
@@ -122,7 +122,7 @@ def wilson(n_successes: int, n_trials: int) -> Estimate:
     """Return a rate with Wilson's interval, as if all trials were independent (Newcombe 1998, method 3)."""
     if n_trials == 0:
         return Estimate(math.nan, math.nan, math.nan)
-    # Of scipy.stats, this alone would be needed, and its import takes a second.
+    # Not from scipy.stats, whose import takes a second.
     z = NormalDist().inv_cdf((1 + LEVEL) / 2)
     rate, whole = n_successes / n_trials, 2 * (n_trials + z**2)
     middle = (2 * n_successes + z**2) / whole
@@ -135,7 +135,7 @@ def wilson(n_successes: int, n_trials: int) -> Estimate:
 
 
 def difference_of_rates(ours: Estimate, theirs: Estimate) -> Estimate:
-    """Return the difference of two independent rates, with the interval that follows from theirs (Newcombe 1998).
+    """Return the difference of two independent rates, with an interval computed from theirs (Newcombe 1998).
 
     The interval is method 10 of doi:10.1002/(SICI)1097-0258(19980430)17:8<873::AID-SIM779>3.0.CO;2-I if theirs are
     Wilson's.
@@ -173,12 +173,12 @@ def _resamples(
         drawn_trainings = rng.integers(shape[0], size=(n_resamples, shape[0], 1, 1))
         drawn = drawn_trainings, rng.integers(shape[1], size=(n_resamples, 1, shape[1], 1))
         within = (rng.random((n_resamples, *members.shape)) * sizes[drawn]).astype(np.intp)
-        # What has fewer episodes than another leaves the rest of its row empty.
+        # Volumes with fewer episodes leave the rest of their row unused.
         chosen = np.where(np.arange(members.shape[-1]) < sizes[drawn], members[(*drawn, within)], -1)
         yield chosen.reshape(n_resamples, -1)
 
 
 def _numbered(labels: Sequence[Hashable]) -> NDArray[np.intp]:
-    """Return the number of each label, in the order in which they come."""
+    """Return the number of each label, in order of first appearance."""
     numbers: dict[Hashable, int] = {}
     return np.array([numbers.setdefault(label, len(numbers)) for label in labels], dtype=np.intp)

@@ -40,7 +40,7 @@ class OnPlane(NamedTuple):
         return distance_mm <= self.mm and distance_deg <= self.deg
 
 
-# The first leads, the second is the strict one.
+# The leading limits, then stricter ones.
 ON_PLANE = (OnPlane(5.0, 10.0), OnPlane(2.0, 5.0))
 
 
@@ -51,14 +51,14 @@ def limits_among(names: Iterable[str]) -> tuple[OnPlane, ...]:
 
 
 def check_on_plane(name: str, limits: object) -> tuple[OnPlane, ...]:
-    """Return limits that were given as pairs, the first of which leads.
+    """Return limits that were given as pairs, the leading ones first.
 
     Args:
         name: Name of the limits in an error, such as `evaluation.on_plane`.
         limits: Pairs of mm and degrees.
 
     Raises:
-        InvalidValueError: If they are not a list, or empty, or a pair is not one, not above 0, or there twice.
+        InvalidValueError: If they are not a list, or empty, or an item is not a pair, not above 0, or there twice.
     """
     if not isinstance(limits, Sequence) or isinstance(limits, str) or not limits:
         raise InvalidValueError(f"{name} is {limits!r}, but it must be {WANTED}")
@@ -69,7 +69,7 @@ def check_on_plane(name: str, limits: object) -> tuple[OnPlane, ...]:
 
 
 def leading_of(params: Mapping[str, str]) -> OnPlane:
-    """Return the leading limits that a run's MLflow parameters name; those by default for older runs."""
+    """Return the leading limits that a run's MLflow parameters name; the default limits for older runs."""
     try:
         return check_on_plane("evaluation.on_plane", json.loads(params["evaluation.on_plane"]))[0]
     except (KeyError, ValueError):

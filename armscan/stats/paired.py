@@ -1,11 +1,11 @@
-"""Paired difference of two groups of trainings that have the same seeds and were evaluated on the same volumes.
+"""Paired difference of two groups of trainings with the same seeds, evaluated on the same volumes.
 
-The difference in each cell of a seed and a volume is the sum of an effect of the training, one of the volume, and a
-rest. The variance of the mean over all cells is that of a two-way layout with random effects, its degrees of freedom
-are Satterthwaite's (1946, doi:10.2307/3002019); so are readers and cases crossed in diagnostic studies (Hillis 2014,
-doi:10.1002/sim.5926). With two or three seeds their mean square is often small by chance; the degrees of freedom are
-then those of the volumes, and too many. So the interval is at least as wide as Student's for other seeds alone, and for
-other volumes alone. Unlike a percentile bootstrap, it is then wide enough for few seeds and volumes.
+The difference for each seed and volume is modelled as a seed effect, a volume effect and a residual: a two-way layout
+with random effects, with Satterthwaite's degrees of freedom (1946, doi:10.2307/3002019), as diagnostic studies cross
+readers and cases (Hillis 2014, doi:10.1002/sim.5926). With two or three seeds their mean square is often small by
+chance; the degrees of freedom are then those of the volumes, which is too many. So the interval is made at least as
+wide as Student's for other seeds alone, and for other volumes alone. Unlike a percentile bootstrap, it is then wide
+enough for few seeds and volumes.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from armscan.utils.arrays import FloatArray
 
 
 def paired_difference(ours: FloatArray, theirs: FloatArray) -> Estimate:
-    """Return the mean difference, ours less theirs, with its 95 % interval for other seeds and other volumes.
+    """Return the mean difference, ours minus theirs, with its 95 % interval for other seeds and other volumes.
 
     Args:
         ours: Our scores, shape (seeds, volumes), all finite.
-        theirs: Their scores of the same seeds and volumes.
+        theirs: Their scores for the same seeds and volumes.
 
     Returns:
-        The estimate; without an interval if there is one seed, which says nothing of others.
+        The estimate; without an interval if there is one seed, which says nothing about others.
 
     Raises:
         InvalidValueError: If the shapes differ.
@@ -58,7 +58,7 @@ def crossed_mean(values: FloatArray) -> tuple[Any, Any]:
         values: Values, shape (..., seeds, volumes).
 
     Returns:
-        Two arrays of shape (...); the second is NaN if there are one seed and one volume.
+        Two arrays of shape (...); the second is NaN if there is one seed and one volume.
     """
     from scipy.special import stdtrit
 
@@ -66,18 +66,18 @@ def crossed_mean(values: FloatArray) -> tuple[Any, Any]:
     means = values.mean(axis=(-2, -1))
     of_seeds, of_volumes = values.mean(axis=-1), values.mean(axis=-2)
     centre = means[..., None]
-    # Mean squares of the seeds, the volumes and the rest; 0 where there is one of a kind.
+    # Mean squares of the seeds, the volumes and the residual; 0 if there is only one seed or volume.
     seeds = n_volumes * ((of_seeds - centre) ** 2).sum(axis=-1) / max(1, n_seeds - 1)
     volumes = n_seeds * ((of_volumes - centre) ** 2).sum(axis=-1) / max(1, n_volumes - 1)
     rest = values - of_seeds[..., :, None] - of_volumes[..., None, :] + centre[..., None]
     rest = (rest**2).sum(axis=(-2, -1)) / max(1, (n_seeds - 1) * (n_volumes - 1))
     if n_seeds == n_volumes == 1:
         return means, np.full_like(means, np.nan)
-    # Each mean square has the rest in it once; where that of the volumes is no larger, they do not differ.
+    # Each mean square contains the residual's once; if the volumes' is no larger, they do not differ.
     differ = volumes > rest if n_seeds > 1 else np.full(means.shape, True)
     variances = np.maximum(seeds + np.where(differ, volumes - rest, 0.0), volumes)
     terms = seeds**2 / max(1, n_seeds - 1) + np.where(differ, volumes**2 / max(1, n_volumes - 1), 0.0)
-    # Without any spread there is no width, with any degrees of freedom.
+    # Without any spread the width is 0, whatever the degrees of freedom.
     df = np.where(terms > 0.0, variances**2 / np.where(terms > 0.0, terms, 1.0), 1.0)
     halves = stdtrit(df, (1 + LEVEL) / 2) * np.sqrt(variances)
     for mean_square, n in ((seeds, n_seeds), (volumes, n_volumes)):

@@ -30,7 +30,7 @@ def run_study(arguments: Sequence[str], launch: Callable[[Sequence[str]], object
     """Run a study, or show what it would run.
 
     Returns:
-        The exit code: 0 if there is a result, 1 where too many trials failed.
+        The exit code: 0 if there is a result, or the study was stopped or only shown; 130 if interrupted; else 1.
     """
     given = StudyCommand.read(arguments)
     silence_libraries()
@@ -42,7 +42,7 @@ def run_study(arguments: Sequence[str], launch: Callable[[Sequence[str]], object
     if launcher in ON_THIS_MACHINE:
         settings.check_workers(n_usable_cores())
     population_of(settings, config)
-    # Before the space is checked, which takes seconds, and anything is made.
+    # Before the space is checked, which takes seconds, and before anything is created.
     storage = existing_storage(settings.storage)
     existing = existing_study(storage, settings, to_plain(config))
     if not given.is_plan:

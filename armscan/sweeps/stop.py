@@ -19,12 +19,12 @@ STOPPED_BY = "at {:%Y-%m-%d %H:%M:%S} by {}"
 
 
 def reason() -> str:
-    """Return the user who stops it, and the time."""
+    """Return the time, and the user who requests the stop."""
     return STOPPED_BY.format(datetime.now(), getpass.getuser())
 
 
 def is_study(storage: Storage | None, name: str) -> bool:
-    """Return whether a study of armscan has this name; the final trainings of one belong to it."""
+    """Return whether a study of armscan has this name; the studies of its final trainings do not count."""
     study = storage.study(name) if storage is not None else None
     return study is not None and is_ours(study)
 
@@ -78,14 +78,14 @@ def stop_running_trial(storage: Storage, trial_id: int) -> bool:
         if trial.state != TrialState.RUNNING or LEASE not in trial.user_attrs:
             return False
         storage.optuna.set_trial_user_attr(trial_id, STOP, reason())
-    # It has ended in between, or there is none.
+    # It has ended in the meantime, or does not exist.
     except (KeyError, UpdateFinishedTrialError):
         return False
     return True
 
 
 def _storage_with(uri: str, name: str) -> Storage:
-    """Open a storage that has a study, to write; nothing is made if there is none."""
+    """Open a storage that has a study, for writing; create nothing if it has none."""
     there = existing_storage(uri, where="--storage")
     if there is None or name not in there.study_names:
         raise StudyError(f"the study is {name!r}, but it is not in {uri!r}: give --storage URI")

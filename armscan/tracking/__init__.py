@@ -1,4 +1,4 @@
-"""MLflow: the store, its runs, and the pictures that go there."""
+"""MLflow tracking: the store, its runs, and their plots."""
 
 from armscan.tracking.client import TrackingStore
 from armscan.tracking.environment import environment_file, environment_tags, source

@@ -20,30 +20,30 @@ if TYPE_CHECKING:
     from mlflow.store.entities import PagedList
 
 T = TypeVar("T")
-# What MLflow says of a store that it cannot reach, of one that fails, and of what is not there.
+# MLflow's error codes for a store that is unavailable, and for something that does not exist.
 UNAVAILABLE, NOT_THERE = (
     ("INTERNAL_ERROR", "TEMPORARILY_UNAVAILABLE", "REQUEST_LIMIT_EXCEEDED"),
     "RESOURCE_DOES_NOT_EXIST",
 )
 MAX_REASON_CHARS = 300
-# A loaded server takes longer for more than it is waited for.
+# On a loaded server, a larger page would exceed the request timeout.
 PER_PAGE = 100
-# What is worth telling of an HTTP client's account of its attempts.
+# The informative part of an HTTP client's error message.
 SHORT = re.compile(
     r"\[Errno -?\d+\] ([\w -]+)|(Connection reset by peer|Connection aborted|[Rr]ead timed out)|(too many 50\d)"
 )
-# A tag of each run: by which one is found again whose making was not answered.
+# Tag of each run, by which a run is found again if the reply to its creation was lost.
 MADE_TAG = "made"
 
 
 class TrackingStore:
-    """An open store with the methods of `MlflowClient`, which wait while the store is unreachable.
+    """An open store with the methods of `MlflowClient`, which are retried while the store is unavailable.
 
     Args:
         connect: Function that opens the store.
         uri: Address of the store, without secrets.
-        wait_s: Seconds for which a run waits for the store at its end.
-        retry_s: Seconds to wait for an unavailable store at other times. Default: None, no waiting.
+        wait_s: Seconds that a run waits for an unavailable store at its end.
+        retry_s: Seconds to retry at other times. Default: None, no retries.
         system_metrics_s: Seconds between two measurements of the machine while a run trains. Default: None, no
             measurements.
     """
@@ -64,7 +64,7 @@ class TrackingStore:
             self._retry_policy = RetryPolicy(
                 "the tracking store", named, unavailable_reason, TrackingUnavailableError, retry_s=retry_s
             )
-        # Which waits for nothing.
+        # The client itself, which is not retried.
         self.mlflow = self._asked(connect)
 
     def __getattr__(self, name: str) -> Any:
@@ -73,7 +73,7 @@ class TrackingStore:
         return partial(self._asked, getattr(self.mlflow, name))
 
     def create_run(self, experiment_id: str, *, name: str, tags: Mapping[str, str]) -> Run:
-        """Make a run, and only one, also where the store becomes unavailable before it has answered."""
+        """Create exactly one run, even if the store becomes unavailable before it replies."""
         made, n_asked = uuid.uuid4().hex, 0
 
         def create() -> Run:
@@ -86,14 +86,14 @@ class TrackingStore:
         return self._asked(create)
 
     def runs(self, experiment_ids: Sequence[str], condition: str = "") -> list[Run]:
-        """Return all runs of experiments that match an MLflow filter, in the order of their starts."""
+        """Return all runs of experiments that match an MLflow filter, ordered by start time."""
         if not experiment_ids:
             return []
         order = ["attributes.start_time ASC"]
         return all_pages(partial(self.search_runs, [*experiment_ids], condition, order_by=order))
 
     def children(self, experiment_id: str, run_id: str) -> list[Run]:
-        """Return the runs directly below a run, in the order of their starts."""
+        """Return the direct child runs of a run, ordered by start time."""
         return self.runs([experiment_id], f"tags.`{PARENT_TAG}` = '{run_id}'")
 
     def _asked(self, operate: Callable[..., T], *args: Any, **kwargs: Any) -> T:
@@ -111,7 +111,7 @@ class TrackingStore:
 
 
 def all_pages(ask: Callable[..., PagedList[T]]) -> list[T]:
-    """Return all that MLflow returns page by page."""
+    """Return the results of all pages of an MLflow search."""
     found: list[T] = []
     token = None
     while True:
@@ -122,7 +122,7 @@ def all_pages(ask: Callable[..., PagedList[T]]) -> list[T]:
 
 
 def unavailable_reason(error: BaseException) -> str | None:
-    """Return why a store cannot be reached or written to for now; None if an error says anything else."""
+    """Return why a store is temporarily unavailable; None if the error means something else."""
     from mlflow.exceptions import MlflowException
     from requests import RequestException
     from sqlalchemy.exc import DBAPIError, OperationalError

@@ -22,24 +22,24 @@ from packaging.utils import canonicalize_name
 
 from armscan.utils.files import sha256
 
-# Those that a run's figures may depend on; of the others, the file has the versions.
+# Packages that a run's results may depend on; the environment file has the versions of all.
 TOLD = ("torch", "tianshou", "gymnasium", "numpy", "numba", "scipy", "simpleitk", "optuna", "mlflow", "hydra-core")
 PACKAGE_FOLDERS = {"site-packages", "dist-packages"}
 PYTHON, CONSTRAINTS_SUM = "version.python", "constraints.sha256"
 UNKNOWN = "unknown"
 HEADER = re.compile(r"^(Name|Version): *(\S+)", re.MULTILINE)
-# Files that nobody has added to git are kept up to this size each: code, and not a volume beside it.
+# Largest untracked file that the diff includes: source code, but no volume beside it.
 MAX_UNTRACKED_BYTES = 2**20
 COMMIT, DIRTY, DIFF_SUM = "git.commit", "git.dirty", "git.diff.sha256"
-# A user's own settings of `git diff` would break `git apply`.
+# Override the user's settings of `git diff`, which could break `git apply`.
 PLAIN = ("--no-ext-diff", "--no-textconv", "--no-color", "--binary", "--src-prefix=a/", "--dst-prefix=b/")
 TIMEOUT_S = 30.0
 
 
 @functools.cache
 def environment() -> Mapping[str, Any]:
-    """Return Python, the machine and the packages of this process, once, as plain values."""
-    # Not what a package has put into its own folder: Ray adds one to the path when it is imported.
+    """Return the Python version, the machine and the packages of this process as plain values, read once."""
+    # Skip packages vendored inside another one: Ray adds such a folder to the path when it is imported.
     folders = [folder for folder in sys.path if not PACKAGE_FOLDERS & {*Path(folder).parent.parts}]
     found = map(_name_and_version, metadata.distributions(path=folders))
     packages = {canonicalize_name(name): version for name, version in found if name}
@@ -52,36 +52,36 @@ def environment() -> Mapping[str, Any]:
 
 
 def _name_and_version(package: metadata.Distribution) -> tuple[str, str]:
-    """Return the two lines that are needed of a package's metadata, which a parser of e-mails reads for a second."""
+    """Return a package's name and version; for all packages, the standard e-mail parser would take a second."""
     text = package.read_text("METADATA") or package.read_text("PKG-INFO") or ""
     fields = dict(HEADER.findall(text.partition("\n\n")[0]))
     return fields.get("Name", ""), fields.get("Version", UNKNOWN)
 
 
 def environment_file() -> bytes:
-    """Return the contents of the file that a run keeps of its environment."""
+    """Return the contents of a run's environment file."""
     return json.dumps(environment(), indent=1).encode()
 
 
 def environment_tags() -> dict[str, str]:
-    """Return the versions that figures may depend on, and the checksum of the constraints to be installed."""
+    """Return, as tags, the versions that results may depend on and the checksum of `constraints.txt`."""
     packages = environment()["packages"]
     constraints = Path(__file__).parents[2] / "constraints.txt"
     return {
         PYTHON: environment()["python"],
         **{f"version.{name}": packages.get(name, "not installed") for name in TOLD},
-        # Beside the code of a clone; a wheel has none.
+        # Only a clone has this file, a wheel does not.
         CONSTRAINTS_SUM: sha256(constraints.read_bytes()) if constraints.is_file() else UNKNOWN,
     }
 
 
 @dataclass(frozen=True)
 class Source:
-    """The code as it was loaded.
+    """State of the source code when it was loaded.
 
     Args:
-        commit: Commit of git; `unknown` if the code is not in a git repository.
-        diff: Uncommitted changes, as `git apply` takes them, empty if there are none; None if they are not known.
+        commit: Git commit; `unknown` if the code is not in a git repository.
+        diff: Uncommitted changes in the format of `git apply`, empty if there are none; None if they are not known.
     """
 
     commit: str
@@ -89,7 +89,7 @@ class Source:
 
     @property
     def tags(self) -> dict[str, str]:
-        """Tags that are tracked of it."""
+        """Tags that identify the code."""
         known = {} if self.commit == UNKNOWN else {"mlflow.source.git.commit": self.commit}
         dirty = UNKNOWN if self.diff is None else str(bool(self.diff)).lower()
         summed = {DIFF_SUM: sha256(self.diff)} if self.diff else {}
@@ -103,10 +103,10 @@ def source() -> Source:
 
 
 def source_in(folder: Path) -> Source:
-    """Return the state of the working tree that a folder with code is in."""
+    """Return the state of the working tree that contains a folder."""
     commit = UNKNOWN
     with contextlib.suppress(OSError, subprocess.SubprocessError):
-        # Packages that are installed somewhere in the tree of another project are none of that project's code.
+        # A package installed inside another project's tree is not part of that project's code.
         if _git(folder, "ls-files", "--", "."):
             commit = _git(folder, "rev-parse", "HEAD").decode().strip()
             tree = os.fsdecode(_git(folder, "rev-parse", "--show-toplevel")).rstrip("\n")
@@ -115,12 +115,12 @@ def source_in(folder: Path) -> Source:
 
 
 def _diff(tree: Path) -> bytes:
-    """Return all that differs from the commit in a working tree, new files included; change nothing."""
+    """Return the diff of a working tree from its commit, including new files; change nothing."""
     new = [name for name in _git(tree, "ls-files", "--others", "--exclude-standard", "-z").split(b"\0") if name]
     kept = [name for name in new if (tree / os.fsdecode(name)).lstat().st_size <= MAX_UNTRACKED_BYTES]
     told = "".join(f"# not kept, for its size: {os.fsdecode(name)!r}\n" for name in new if name not in kept).encode()
     with tempfile.TemporaryDirectory() as beside:
-        # New files are in a diff where they are about to be added: in an index of its own, a copy.
+        # A diff shows new files only if the index lists them: list them in a copy of the index.
         index = Path(beside, "index")
         shutil.copyfile(tree / os.fsdecode(_git(tree, "rev-parse", "--git-path", "index")).rstrip("\n"), index)
         if kept:
@@ -130,8 +130,8 @@ def _diff(tree: Path) -> bytes:
 
 
 def _git(folder: Path, *arguments: str, index: Path | None = None, given: bytes = b"") -> bytes:
-    """Return the output of git for this input."""
-    # A hook of another repository would have its say here.
+    """Run git in a folder, and return its output."""
+    # Inside a git hook, these variables point to the hook's repository.
     variables = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
     if index is not None:
         variables["GIT_INDEX_FILE"] = str(index)

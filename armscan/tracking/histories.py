@@ -1,4 +1,4 @@
-"""Histories of many runs' metrics, by one request for each metric rather than one for each run."""
+"""Metric histories of many runs, with one request per metric instead of one per run."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from armscan.tracking.client import TrackingStore
 if TYPE_CHECKING:
     from mlflow import MlflowClient
 
-# What an MLflow server answers at once; a database is asked for no more.
+# An MLflow server's limits per request, also kept for a database.
 MAX_RUNS, MAX_POINTS = 100, 25_000
-# Of MLflow's own UI: `MlflowClient` has no such request.
+# Route of MLflow's own UI: `MlflowClient` has no such request.
 ROUTE = "/ajax-api/2.0/mlflow/metrics/get-history-bulk"
 
 History = dict[int, float]
@@ -26,11 +26,11 @@ def metric_histories(store: TrackingStore, names: Mapping[str, Collection[str]])
     """Return histories of metrics.
 
     Args:
-        store: Store of the runs, which is not waited for.
-        names: Names of the metrics that are wanted of each run, by its MLflow run ID.
+        store: Store of the runs; requests are not retried.
+        names: Names of the requested metrics, by MLflow run ID.
 
     Returns:
-        By run ID and name, the values by step; of several at one step, the last.
+        The values by run ID, metric name and step; the last one if a step has several.
     """
     runs_of: dict[str, list[str]] = defaultdict(list)
     histories: dict[str, dict[str, History]] = {run_id: {name: {} for name in names[run_id]} for run_id in names}
@@ -45,12 +45,12 @@ def metric_histories(store: TrackingStore, names: Mapping[str, Collection[str]])
 
 
 def _points(client: MlflowClient, run_ids: Sequence[str], name: str) -> Iterator[Point]:
-    """Yield all points of a metric, those of a run in the order in which they were logged."""
+    """Yield all points of a metric, for each run in the order in which they were logged."""
     found = _bulk(client, run_ids, name)
     if found is not None and len(found) < MAX_POINTS:
         yield from found
     elif found is not None and len(run_ids) > 1:
-        # Cut off.
+        # The reply was truncated.
         middle = len(run_ids) // 2
         yield from _points(client, run_ids[:middle], name)
         yield from _points(client, run_ids[middle:], name)
@@ -60,7 +60,7 @@ def _points(client: MlflowClient, run_ids: Sequence[str], name: str) -> Iterator
 
 
 def _bulk(client: MlflowClient, run_ids: Sequence[str], name: str) -> list[Point] | None:
-    """Return at most `MAX_POINTS` points of a metric; None if the store does not answer such a request."""
+    """Return at most `MAX_POINTS` points of a metric; None if the store does not support such a request."""
     store: Any = client._tracking_client.store
     if hasattr(store, "get_metric_history_bulk"):
         points = store.get_metric_history_bulk(run_ids, name, MAX_POINTS)

@@ -1,4 +1,4 @@
-"""The best checkpoint of a run as a `LoggedModel` of MLflow: its settings, and its metrics on which volumes."""
+"""The best checkpoint of a run as an MLflow `LoggedModel`, with its settings and its metrics by dataset."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ if TYPE_CHECKING:
     from mlflow.entities import LoggedModel, Metric, Run
 
 MODEL_TYPE = "policy"
-# MLflow's own, by which its UI links a model with the versions that were registered of it.
+# MLflow's own tag, by which its UI links a model to its registered versions.
 VERSIONS_TAG = "mlflow.modelVersions"
 CONTEXT_TAG = "mlflow.data.context"
 PARAMS = ("projection", "seed")
-# What MLflow refuses in the name of a model.
+# Characters that MLflow refuses in a model name.
 REFUSED = re.compile(r"[/:.%\"']")
-# Of a server that has no such models yet.
+# Error code of a server that does not have logged models yet.
 UNKNOWN = "ENDPOINT_NOT_FOUND"
 
 
 def deliver_model(client: MlflowClient, run_id: str, step: int, metrics: Mapping[str, Sequence[str]]) -> None:
-    """Make a model of a run's best checkpoint, or complete it; what is there already is not made again.
+    """Create the model of a run's best checkpoint, or complete an existing one.
 
     Args:
         client: Client of the run's store.
         run_id: MLflow run ID.
-        step: Environment step of the checkpoint, at which the run's metrics are the model's.
-        metrics: Names of these metrics, by the part (validation, test) of the volumes that they are of.
+        step: Environment step of the checkpoint; the run's metrics at this step become the model's.
+        metrics: Names of these metrics, by the split (validation, test) that they were measured on.
     """
     from mlflow.entities import LoggedModelOutput
     from mlflow.exceptions import MlflowException
@@ -75,7 +75,7 @@ def _made(client: MlflowClient, run: Run, step: int) -> LoggedModel:
 def _metrics(
     client: MlflowClient, run: Run, model_id: str, step: int, metrics: Mapping[str, Sequence[str]]
 ) -> Iterator[Metric]:
-    """Yield metrics of the run as those of its model; they equal the run's own, which therefore stay as they are."""
+    """Yield metrics of the run as those of its model; they equal the run's own, which therefore do not change."""
     from mlflow.entities import Metric
 
     datasets: dict[str, Any] = {

@@ -1,4 +1,4 @@
-"""Find a run in the store by its ID or the ID's beginning; read its configuration and checkpoint."""
+"""Find a run in the store by its ID or its first characters; read its configuration and checkpoint."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class FoundRun:
         status: Status of the run, such as RUNNING or FINISHED.
         tags: Tags of the run.
         files: Paths of its artifacts.
-        needs_trust: Whether its configuration names classes that are not armscan's, according to its parameters.
+        needs_trust: Whether, judging by its parameters, its configuration is read with `--trust` only.
     """
 
     client: TrackingStore = field(repr=False)
@@ -56,15 +56,15 @@ class FoundRun:
     needs_trust: bool
 
     def config(self, folder: Path, *, trust: bool = False) -> dict[str, Any]:
-        """Return the resolved configuration, with the keys of this version.
+        """Return the run's resolved configuration, with the keys of this version.
 
         Args:
             folder: Folder to download the file to.
             trust: Whether it may name classes that are not armscan's. Default: False.
 
         Raises:
-            UntrustedError: If it is not trusted, and names other classes.
-            TrackingError: If the run has kept none, it is damaged, or not the one that the run was started with.
+            UntrustedError: If it is not trusted, and names other classes or holds an interpolation.
+            TrackingError: If it is missing, damaged, or not the one that the run was started with.
         """
         try:
             config = dict(load_yaml(self._started_with(CONFIG_FILE, folder)))
@@ -73,20 +73,20 @@ class FoundRun:
         return stored_config(config, where=f"run {self.run_id}", trust=trust)
 
     def checkpoint(self, folder: Path) -> Path | None:
-        """Return the best checkpoint, fetched into `folder`; None if the run has kept none."""
+        """Download the best checkpoint to `folder` and return its path; None if the run has none."""
         return self._fetched(BEST_CHECKPOINT, folder) if BEST_CHECKPOINT in self.files else None
 
     def volumes(self, folder: Path) -> Fingerprints | None:
-        """Return the fingerprints of its volumes; None if the run was made before these were kept."""
+        """Return the fingerprints of the run's volumes; None if an earlier version made the run, without them."""
         if SHA256_TAGS[VOLUMES_FILE] not in self.tags:
             return None
-        # Deferred: a mistake on the command line is answered before it is loaded.
+        # Deferred: a mistake on the command line is reported before it is loaded.
         from armscan.training import fingerprints_in
 
         return fingerprints_in(self._started_with(VOLUMES_FILE, folder), f"run {self.run_id}: its {VOLUMES_FILE}")
 
     def text(self, file: str, folder: Path) -> str | None:
-        """Return the text of an artifact, fetched into `folder`; None if the run has none of this name."""
+        """Download a text artifact to `folder` and return its contents; None if the run has no such artifact."""
         return self._fetched(file, folder).read_text(errors="replace") if file in self.files else None
 
     def _started_with(self, file: str, folder: Path) -> bytes:
@@ -108,10 +108,11 @@ class FoundRun:
 
 
 def load_run(uri: str, run_id: str) -> FoundRun:
-    """Return the run of an MLflow run ID, or of its first characters, with its files.
+    """Return the run with an MLflow run ID, or with these first characters of it, and its files.
 
     Raises:
-        TrackingError: If no run is meant, or several are, or the store does not exist or cannot be used.
+        TrackingError: If no run or several runs match, the run is a multirun's parent or a newer version's, or the
+            store does not exist or cannot be used.
     """
     check_run_id(run_id)
     client = open_existing_store(uri)
@@ -137,10 +138,10 @@ def load_run(uri: str, run_id: str) -> FoundRun:
 
 
 def find_run(client: TrackingStore, run_id: str) -> Run:
-    """Return the run of an MLflow run ID, or of its first characters, in any experiment of a store.
+    """Return the run with an MLflow run ID, or with these first characters of it, in any experiment of a store.
 
     Raises:
-        TrackingError: If no run is meant, or several are.
+        TrackingError: If no run or several runs match.
     """
     check_run_id(run_id)
     experiments = all_pages(client.search_experiments)
@@ -161,18 +162,18 @@ def find_run(client: TrackingStore, run_id: str) -> Run:
 def run_of_study(
     client: TrackingStore, run_id: str, *, experiment_id: str, tags: Mapping[str, str | None], where: str
 ) -> Run:
-    """Return a run that the storage of a study names: a stranger may have written there the ID of any run.
+    """Return a run that a study's storage names, once checked: a stranger may have written the ID of any run there.
 
     Args:
         client: Client of the store.
         run_id: MLflow run ID.
         experiment_id: MLflow experiment of the study.
         tags: Required values of the run's tags, which show that it belongs to the study; None for a tag that it must
-            lack.
+            not have.
         where: Attribute that names the run, such as `a.user_attrs.mlflow_run`, for the error.
 
     Raises:
-        TrackingError: If it is another run, or the store does not have it.
+        TrackingError: If the run does not belong to the study, or is not in the store.
     """
     with store_errors(client.uri):
         run: Run = client.get_run(run_id)
@@ -193,7 +194,7 @@ def check_run_id(run_id: str) -> None:
 
 
 def check_version(run: Run) -> None:
-    """Raise `TrackingError` if a run was made by a newer version, which may have kept it otherwise, or by none."""
+    """Raise `TrackingError` if a newer version made a run, perhaps in another format, or its version is invalid."""
     version = run.data.tags.get(VERSION_TAG, armscan.__version__)
     try:
         is_newer = Version(version).release > Version(armscan.__version__).release

@@ -1,4 +1,4 @@
-"""Notes of this machine: runs with entries to upload, or without an end."""
+"""This machine's notes of runs that may have entries to upload, or have not ended."""
 
 from __future__ import annotations
 
@@ -15,16 +15,19 @@ NOTES_FOLDER = "undelivered"
 
 
 def forget(run_id: str) -> None:
-    """Remove the note of a run: everything is uploaded, or the run is removed."""
+    """Remove the note of a run, once everything is uploaded or the run is deleted."""
     with contextlib.suppress(OSError):
         (cache_folder() / NOTES_FOLDER / run_id).unlink(missing_ok=True)
 
 
 @dataclass(frozen=True)
 class Note:
-    """Note of this machine about a run, by its outbox: it may have entries to upload, or no end.
+    """This machine's note of a run that may have entries to upload, or may not have ended.
 
-    It names the address of the run's tracking store, and the process that tracks the run.
+    Args:
+        outbox: File of the run's outbox.
+        uri: Address of the run's tracking store.
+        process: Process that tracks the run.
     """
 
     outbox: Path
@@ -33,7 +36,7 @@ class Note:
 
     @classmethod
     def read(cls, file: Path) -> Self | None:
-        """Return the note in a file, None if there is none; that of an earlier version is a link to the outbox."""
+        """Return the note in a file, None if there is none; an earlier version's note is a link to the outbox."""
         try:
             if file.is_symlink():
                 return cls(file.readlink(), "", ProcessInfo.of({}))
@@ -48,7 +51,7 @@ class Note:
         return cls.read(cache_folder() / NOTES_FOLDER / run_id)
 
     def write(self, file: Path) -> None:
-        """Write it to a file."""
+        """Write the note to a file."""
         told = {"outbox": str(self.outbox), "uri": self.uri, "process": asdict(self.process)}
         atomic_write(file, lambda opened: opened.write(json.dumps(told).encode()))
 
@@ -59,6 +62,6 @@ class Note:
 
 
 def notes() -> dict[str, Note]:
-    """Return the notes of this machine by the IDs of their runs."""
+    """Return this machine's notes by run ID."""
     files = sorted((cache_folder() / NOTES_FOLDER).glob("*"))
     return {file.name: note for file in files if (note := Note.read(file)) is not None}

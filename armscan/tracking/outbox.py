@@ -1,8 +1,8 @@
 """The outbox of a run: a file in its folder that buffers everything to upload to the tracking store.
 
-A line is an entry: metrics, parameters, tags, a file to upload, or the run's status. A second file says how far the
-entries are uploaded. So nothing is lost when the store is unavailable or the process is killed; an entry that is
-uploaded twice, because only the answer was lost, changes nothing in the store.
+Each line is an entry: metrics, parameters, tags, a file to upload, or the run's status. A second file records how far
+the entries are uploaded, so nothing is lost when the store is unavailable or the process is killed. Uploading an entry
+twice, because only the reply was lost, changes nothing in the store.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ from armscan.utils.files import (
 from armscan.utils.processes import ProcessInfo
 
 Entry = dict[str, Any]
-# Uploaded independently: metrics arrive although the disk of the artifacts is full.
+# Uploaded independently: metrics arrive even if the disk of the artifacts is full.
 Channel = Literal["figures", "files"]
 CHANNELS: tuple[Channel, ...] = ("files", "figures")
 DELIVERED, LOCK, SUFFIX = OUTBOX_SUFFIXES
 ID = re.compile(r"[\w-]{1,64}", re.ASCII)
-# The process that had the run before may still be ending.
+# The run's previous process may still be shutting down.
 LOCK_TIMEOUT_S = 20.0
 
 
@@ -48,7 +48,7 @@ class Address:
     """Destination of an outbox: the ID of a run, and the address of its tracking store.
 
     Raises:
-        TrackingError: If the ID is none; files are named after it.
+        TrackingError: If the ID is invalid; files are named after it.
     """
 
     run_id: str
@@ -105,7 +105,7 @@ class OutboxFile:
                 if ("file" in entry) == (channel == "files"):
                     entries.append(entry)
         if not entries:
-            # Entries of the other channel are not read again each time.
+            # Do not read the other channel's entries again next time.
             self._delivered[channel] = end
         return entries, end
 
@@ -130,7 +130,7 @@ class OutboxFile:
         return entry
 
     def _read_delivered(self) -> dict[Channel, int]:
-        """Return how far each channel is uploaded; an impossible position is ignored: uploading twice does no harm."""
+        """Return how far each channel is uploaded; ignore an invalid position, as uploading twice does no harm."""
         try:
             ends = dict(json.loads(self._delivered_file.read_bytes()))
         except (FileNotFoundError, ValueError, TypeError):
@@ -155,17 +155,17 @@ class Outbox(OutboxFile):
     Raises:
         TrackingError: If the file is damaged.
         FolderInUseError: If another process holds it.
-        FileNotFoundError: If there is no such file; nothing is made in its place.
+        FileNotFoundError: If there is no such file; it is not created.
     """
 
     def __init__(self, file: Path, *, timeout_s: float = LOCK_TIMEOUT_S) -> None:
-        # The lock would make the folder of a run again that was removed.
+        # Acquiring the lock would recreate the folder of a removed run.
         file.stat()
-        # A stranger's folder may have links to any file of this user, which would be written to.
+        # Links in a stranger's folder may lead to any file of this user, which this process would write to.
         links = [each for each in (file.parent, *map(file.with_suffix, OUTBOX_SUFFIXES)) if each.is_symlink()]
         if links:
             raise TrackingError(f"{links[0]}: is a link, but outboxes are files of the run's own folder")
-        # Also who is told to leave closes it, in another thread.
+        # A process that is told to leave releases it from another thread.
         self._lock = FileLock(file.with_suffix(LOCK), timeout=timeout_s, thread_local=False)
         try:
             self._lock.acquire()
@@ -201,18 +201,18 @@ class Outbox(OutboxFile):
             with named_if_full(self.file):
                 n_written = self._appending.write(line)
             if n_written != len(line):
-                # A full disk; half a line would be in the way of the next.
+                # The disk is full: remove the partial line, which would corrupt the next one.
                 os.truncate(self._appending.fileno(), size)
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.file))
 
     def mark(self, channel: Channel, end: int) -> None:
-        """Note how far a channel is uploaded."""
+        """Record how far a channel is uploaded."""
         self._delivered[channel] = end
         text = json.dumps(self._delivered)
         atomic_write(self._delivered_file, lambda opened: opened.write(text.encode()))
 
     def note(self) -> None:
-        """Note on this machine that the run has something to upload, so that the next start finds it."""
+        """Write this machine's note of the run, so that the next start uploads what is left."""
         # Nothing is lost without the note: `armscan runs sync` finds the outbox.
         with contextlib.suppress(OSError):
             folder = cache_folder() / NOTES_FOLDER
@@ -227,7 +227,7 @@ class Outbox(OutboxFile):
 
 
 def now_ms() -> int:
-    """Return the time as MLflow has it."""
+    """Return the current time in MLflow's unit, milliseconds since 1970."""
     return time.time_ns() // 1_000_000
 
 
@@ -238,7 +238,7 @@ def file_of(folder: Path, run_id: str) -> Path:
 
 
 def file_and_place(value: str | list[str]) -> tuple[str, str | None]:
-    """Return the name of a file to upload, relative to the run's folder, and its folder among the artifacts."""
+    """Return a file to upload, relative to the run's folder, and its artifact folder; None for the artifact root."""
     return (value, None) if isinstance(value, str) else (value[0], value[1])
 
 
@@ -252,7 +252,7 @@ def take_over(run_id: str, before: Path, folder: Path) -> None:
     old, new = file_of(before, run_id), file_of(folder, run_id)
     if old.exists():
         new.parent.mkdir(parents=True, exist_ok=True)
-        # What is not noted as delivered is delivered again, which changes nothing; so the order matters little.
+        # The order matters little: entries not recorded as uploaded are uploaded again, which changes nothing.
         if old.with_suffix(DELIVERED).exists():
             old.with_suffix(DELIVERED).replace(new.with_suffix(DELIVERED))
         old.replace(new)

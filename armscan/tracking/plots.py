@@ -1,4 +1,4 @@
-"""The picture of a learning curve."""
+"""The plot of a learning curve."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def draw_learning_curve(reports: Sequence[EpochReport], path: Path, *, title: st
 
     steps = [report.n_env_steps for report in reports]
     figure = Figure(figsize=(8, 5.4))
-    # A layout that matplotlib finds by itself takes a second drawing.
+    # Fixed margins: matplotlib's automatic layout draws the figure twice.
     figure.subplots_adjust(left=0.09, right=0.98, bottom=0.09, top=0.92, hspace=0.08)
     FigureCanvasAgg(figure)
     rates, lengths = figure.subplots(2, 1, sharex=True, height_ratios=[3, 2])
@@ -45,7 +45,7 @@ def draw_learning_curve(reports: Sequence[EpochReport], path: Path, *, title: st
     lengths.set_ylabel("steps, mean")
     lengths.set_ylim(bottom=0)
     lengths.set_xlabel("environment steps")
-    # Where curves seldom are; to look for the best place takes seconds, and a warning, on a busy machine.
+    # Corners that curves rarely reach: matplotlib's search for the best one takes seconds on a busy machine, and warns.
     for axes, place in ((rates, "lower right"), (lengths, "upper right")):
         axes.legend(loc=place)
         axes.grid(alpha=0.3)

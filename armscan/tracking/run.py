@@ -27,26 +27,26 @@ if TYPE_CHECKING:
     from armscan.training import EpochReport
 
 MODEL_FILE = "MLmodel"
-# After the name of a run whose trial was pruned.
+# Suffix of the name of a run whose trial was pruned.
 PRUNED = " (pruned)"
-# No run of armscan has so many runs above it; a stranger's may be above themselves.
+# No run of armscan has this many ancestors; a stranger's run may be its own ancestor.
 MAX_DEPTH = 8
 MAX_REASON_CHARS, MAX_DIGITS = 5000, 9
-# For a store that is unavailable, where somebody waits for this process to end.
+# Wait for an unavailable store while somebody waits for this process to end.
 SHORT_WAIT_S = 2.0
 
 
 class TrackedRun:
-    """A run in MLflow, and the training callback that fills it.
+    """A run in MLflow, and the training callback that logs to it.
 
     Everything logged goes to the run's outbox and is uploaded in the background, so training never waits for the store.
-    `armscan runs sync FOLDER` uploads what a store that was unavailable has missed.
+    `armscan runs sync FOLDER` uploads what is left if the store was unavailable.
 
     Args:
         store: Store of the run.
         outbox: Outbox of the run.
         name: Name of the run in the UI.
-        logged: Names and steps of the metrics that are already in the store, which are not logged again.
+        logged: Names and steps of metrics that an earlier process logged, which are not logged again. Default: none.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class TrackedRun:
         folder: Path,
         parent_id: str | None = None,
     ) -> Self:
-        """Make a new run.
+        """Create a run.
 
         Args:
             store: Store of the run.
@@ -82,7 +82,7 @@ class TrackedRun:
             config: Resolved configuration, whose leaves become parameters.
             tags: Tags of the run, beside those of the source code.
             folder: Folder of the run.
-            parent_id: ID of the run that it is shown below. Default: None, no run.
+            parent_id: ID of its parent run. Default: None, no parent.
         """
         parent = {PARENT_TAG: parent_id} if parent_id else {}
         run = store.create_run(experiment_id, name=name, tags={**source().tags, **tags, **parent})
@@ -92,7 +92,7 @@ class TrackedRun:
 
     @classmethod
     def joined(cls, store: TrackingStore, run_id: str, *, name: str, folder: Path) -> Self:
-        """Return an existing run, to add to it."""
+        """Open an existing run to add to it."""
         return cls(store, Outbox.begin(folder, Address(run_id, store.uri)), name=name)
 
     @classmethod
@@ -122,7 +122,7 @@ class TrackedRun:
         if had_outbox:
             logged = {(name, step) for entry in outbox.entries() for name, _, _, step in entry.get("metrics", ())}
         else:
-            # An earlier version has made the run.
+            # An earlier version made the run, without an outbox.
             histories = {name: store.get_metric_history(run_id, name) for name in run.data.metrics}
             logged = {(name, point.step) for name, points in histories.items() for point in points}
         tracked = cls(store, outbox, name=run.info.run_name or run_id, logged=logged)
@@ -141,14 +141,14 @@ class TrackedRun:
             self._add(tags=tags_of(tags))
 
     def set_pruned(self) -> None:
-        """Show that the trial of this run was pruned: by a tag, and by the name."""
+        """Mark the run's trial as pruned, with a tag and in the run's name."""
         self.set_tags({PRUNED_TAG: "true", "mlflow.runName": f"{self.name.removesuffix(PRUNED)}{PRUNED}"})
 
     def log_datasets(self, prints: Mapping[str, Mapping[str, str]]) -> None:
         """Log the volumes as datasets of the run.
 
         Args:
-            prints: Fingerprint of each volume by its name, by split (training, validation, test).
+            prints: Fingerprints of the volumes, by split (training, validation, test) and name.
         """
         self._add(datasets=[[part, volumes] for part, volumes in prints.items() if volumes])
 
@@ -157,7 +157,7 @@ class TrackedRun:
             self._add(params=params)
 
     def on_start(self, total_env_steps: int, earlier: Sequence[EpochReport]) -> None:
-        """Log the metrics that are missing because the run was killed, and start to monitor the machine."""
+        """Log the metrics that are missing because the run was killed, and start monitoring the machine."""
         for report in earlier:
             self.on_epoch(report)
         if (every_s := self._store.system_metrics_s) is not None:
@@ -169,7 +169,7 @@ class TrackedRun:
             )
 
     def on_epoch(self, report: EpochReport) -> None:
-        """Log an epoch's figures by environment step."""
+        """Log an epoch's metrics at its environment step."""
         figures = {f"validation/{name}": value for name, value in report.evaluation.metrics().items()}
         figures |= report.metrics | {"wall_s": report.wall_s}
         self.log_metrics(figures, n_env_steps=report.n_env_steps)
@@ -181,39 +181,39 @@ class TrackedRun:
             self._system = None
 
     def log_metrics(self, figures: Mapping[str, float], *, n_env_steps: int) -> None:
-        """Log figures at an environment step, each once."""
+        """Log metrics at an environment step, except NaN and those that an earlier process logged."""
         at_ms = now_ms()
         points = [
             (name, float(value), at_ms, n_env_steps)
             for name, value in figures.items()
-            # MLflow has no place for a mean over no episodes, which is NaN.
+            # NaN is the mean over no episodes.
             if value == value and (name, n_env_steps) not in self._logged
         ]
         if points:
             self._add(metrics=points)
 
     def log_model(self, metrics: Mapping[str, Sequence[str]], *, n_env_steps: int) -> None:
-        """Show the best checkpoint as a model of MLflow, which has these of the run's metrics.
+        """Log the best checkpoint as an MLflow model, with these metrics of the run.
 
         Args:
-            metrics: Names of metrics, by the part (training, validation, test) of the volumes that they are of.
+            metrics: Names of metrics, by the split (training, validation, test) that they were measured on.
             n_env_steps: Environment step of the checkpoint, at which they were logged.
         """
         self._add(model=[n_env_steps, {part: list(names) for part, names in metrics.items()}])
 
     def set_note(self, text: str) -> None:
-        """Give the run a description in Markdown, shown first on its page of MLflow, unless a person wrote one."""
+        """Set the run's description in Markdown, shown at the top of its MLflow page, unless a person wrote one."""
         self._add(note=text)
 
     def log_files(self, *files: Path) -> None:
-        """Keep files as artifacts; they stay as they are until the run has ended."""
+        """Upload files as artifacts; they must not change until the run has ended."""
         for file in files:
             self._add(file=os.path.relpath(file, self._outbox.folder))
 
     def log_folder(self, folder: Path) -> None:
-        """Keep a folder with all that is in it, under its own name; it stays as it is until the run has ended."""
+        """Upload a folder with all its files, under its own name; it must not change until the run has ended."""
         files = [file for file in folder.rglob("*") if file.is_file()]
-        # Last what says of a folder that it is a model: who finds it finds all of it.
+        # `MLmodel`, which marks a folder as a model, is uploaded last: then the other files are there.
         for file in sorted(files, key=lambda file: (file.name == MODEL_FILE, file)):
             name, place = os.path.relpath(file, self._outbox.folder), file.parent.relative_to(folder.parent)
             self._add(file=[name, place.as_posix()])
@@ -237,26 +237,26 @@ class TrackedRun:
                 self.end("KILLED", reason="interrupted", wait_s=SHORT_WAIT_S)
             else:
                 self.end("FAILED", reason=repr(error))
-        # A full disk that has ended the run: its error is the one to tell, and the next start ends the run.
+        # A full disk may have ended the run: report that error; the next start closes the run.
         except OSError as failure:
             log(f"run {self.run_id}: its end is not noted ({failure.strerror})")
 
     def resume(self) -> None:
-        """Mark the run as RUNNING again, also if it was ended after its last process had died."""
+        """Mark the run as RUNNING again, even if it was closed after its last process died."""
         self._is_resumed = True
         self._add(status=("RUNNING", now_ms()))
         self._add(untagged=FAILURE_TAG)
 
     def end(self, status: str, *, reason: str | None = None, wait_s: float | None = None) -> bool:
-        """Close the run as FINISHED, FAILED (with the reason) or KILLED, and wait until the store has all of it.
+        """Close the run, and wait until everything is uploaded.
 
         Args:
             status: Status: FINISHED, FAILED or KILLED.
-            reason: Reason of a failure. Default: None.
-            wait_s: Seconds to wait for an unavailable store. Default: those of the configuration.
+            reason: Why the run failed or was interrupted. Default: None, it did not.
+            wait_s: Seconds to wait for an unavailable store. Default: None, `wait_s` of the store.
 
         Returns:
-            Whether the store has all of it; the rest is in the folder of the run.
+            Whether everything is uploaded; the rest stays in the run's folder.
         """
         if self._is_closed:
             return self._is_delivered
@@ -264,7 +264,7 @@ class TrackedRun:
         if reason is not None:
             self._add(tags={FAILURE_TAG: reason[:MAX_REASON_CHARS]})
         elif self._is_resumed:
-            # Who took the one before for dead may have said so since.
+            # Another process that took the earlier one for dead may have set it since.
             self._add(untagged=FAILURE_TAG)
         self._add(status=(status, now_ms()))
         failure = self._uploader.finish(self._store.wait_s if wait_s is None else wait_s)

@@ -1,4 +1,4 @@
-"""The MLflow store: opened once, by one process at a time."""
+"""Open and check the MLflow tracking store and its experiment."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ from armscan.utils.validation import check_bool, check_float
 
 EXAMPLES = {"uri": "sqlite:///mlruns.db", "experiment": "armscan", "artifacts": "mlartifacts"}
 LOCK_TIMEOUT_S = 120
-# What MLflow takes of the name of an experiment, and of its place of artifacts.
+# MLflow's length limit for an experiment's name and artifact location, and how much of a longer one an error shows.
 MAX_TEXT_CHARS, N_SHOWN_CHARS = 500, 40
-# Where there is no configuration that says it.
+# `wait_s` of a store that is opened without a configuration.
 USUAL_WAIT_S = 120.0
-# A server that is unavailable should be said to be so within seconds, not after minutes of retries.
+# Report an unavailable server within seconds, not after minutes of retries.
 DEFAULTS = {
     "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "2",
     "MLFLOW_HTTP_REQUEST_TIMEOUT": "20",
-    # Nobody has asked for it, and on a cluster it goes nowhere.
+    # Nobody asked for it, and from a cluster it cannot be sent.
     "MLFLOW_DISABLE_TELEMETRY": "true",
-    # Between the lines of a worker's log nobody looks for bars and addresses.
+    # Progress bars and addresses would only clutter a worker's log.
     "MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR": "false",
     "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",
 }
@@ -51,21 +51,20 @@ def open_store(
     policy: bool = True,
     retry_s: float | None = None,
 ) -> tuple[TrackingStore, str]:
-    """Open a tracking store and make the experiment if it does not exist yet.
+    """Open a tracking store, and create the experiment if it does not exist yet.
 
     Args:
         uri: MLflow tracking URI, such as `sqlite:///mlruns.db` or the address of an MLflow server.
         experiment: Name of the experiment.
         artifacts: Folder of the artifacts if the store is a database; a server has its own place for them.
-        wait_s: Seconds for which a run waits for the store at its end, 0 or more.
+        wait_s: Seconds that a run waits for an unavailable store at its end, 0 or more.
         system_metrics_s: Seconds between two measurements of the machine while a run trains, above 0. Default: None, no
             measurements.
         policy: Whether runs store their policies; only checked here, with the rest of the section. Default: True.
-        retry_s: Seconds to wait for an unavailable store at other times, also while it is opened. Default: None, no
-            waiting.
+        retry_s: Seconds to retry at other times, including the opening of the store. Default: None, no retries.
 
     Returns:
-        The store, and the experiment's id.
+        The store, and the experiment's ID.
 
     Raises:
         TrackingError: If the store cannot be reached or used.
@@ -86,7 +85,7 @@ def open_store(
         # Processes that create the tables of a fresh SQLite file at once can leave it unusable.
         database = sqlite_file(uri)
         database.parent.mkdir(parents=True, exist_ok=True)
-        # MLflow would try for minutes to open what cannot be opened, and the lock for ever to be made.
+        # Fail now if the file cannot be created: MLflow would retry for minutes, and the lock would wait forever.
         database.open("ab").close()
         with FileLock(f"{database}.lock", timeout=LOCK_TIMEOUT_S):
             store = connected(f"{SQLITE_PREFIX}{database}")
@@ -96,7 +95,7 @@ def open_store(
 def check_settings(
     uri: object, *, experiment: object, artifacts: object, wait_s: Any, system_metrics_s: Any = None, policy: Any = True
 ) -> None:
-    """Raise `TrackingError` or `InvalidValueError` where settings of a store are not allowed; see `open_store`."""
+    """Raise `TrackingError` or `InvalidValueError` if a setting of a store is not allowed; see `open_store`."""
     _check_texts(uri=uri, experiment=experiment, artifacts=artifacts)
     _check_address(str(uri))
     check_float("tracking.wait_s", wait_s, at_least=0.0)
@@ -106,7 +105,7 @@ def check_settings(
 
 
 def open_existing_store(uri: str) -> TrackingStore:
-    """Open a tracking store to look for a run in it, and make nothing; raise `TrackingError` if there is none."""
+    """Open an existing tracking store without creating anything; raise `TrackingError` if there is none."""
     _check_texts(uri=uri)
     _check_address(uri)
     if uri.startswith(SQLITE_PREFIX):
@@ -124,7 +123,7 @@ def open_existing_store(uri: str) -> TrackingStore:
 
 
 def _check_is_store(uri: str, database: Path) -> None:
-    """Raise `TrackingError` if a database holds something else, into which MLflow would write its own tables."""
+    """Raise `TrackingError` if a database is not an MLflow store: MLflow would create its tables in it."""
     wanted = "SELECT count(*) FROM sqlite_master WHERE name IN ('alembic_version', 'experiments', 'runs')"
     try:
         with contextlib.closing(sqlite3.connect(f"{database.as_uri()}?mode=ro", uri=True)) as connection:
@@ -140,7 +139,7 @@ def _check_is_store(uri: str, database: Path) -> None:
 def _store(
     uri: str, *, wait_s: float, system_metrics_s: float | None = None, retry_s: float | None = None
 ) -> TrackingStore:
-    """Return an open store; its client gets the driver and the password of a database."""
+    """Return an open store; only its client gets the driver and the password of a database."""
     from mlflow import MlflowClient
 
     address = uri
@@ -151,7 +150,7 @@ def _store(
 
 
 def absolute(uri: str) -> str:
-    """Return the address of a store as it is understood from everywhere."""
+    """Return the address of a store with an absolute path, which is valid in any working folder."""
     return f"{SQLITE_PREFIX}{sqlite_file(uri)}" if uri.startswith(SQLITE_PREFIX) else uri
 
 
@@ -178,7 +177,7 @@ def _check_address(uri: str) -> None:
 
 @contextlib.contextmanager
 def store_errors(uri: str) -> Iterator[None]:
-    """Turn the errors of a store into a `TrackingError` of one line, with short time-outs and no warnings."""
+    """Turn the errors of a store into a one-line `TrackingError`, with short timeouts and no warnings."""
     for name, value in DEFAULTS.items():
         os.environ.setdefault(name, value)
     from mlflow.exceptions import MlflowException
@@ -186,15 +185,15 @@ def store_errors(uri: str) -> Iterator[None]:
 
     if SERVER_PASSWORD not in os.environ and (password := read_password(SERVER_PASSWORD)):
         os.environ[SERVER_PASSWORD] = password
-    # The making of a new database is told table by table.
+    # They log each table of a new database.
     for library in ("alembic", "mlflow"):
         logging.getLogger(library).setLevel(logging.WARNING)
-    # What they tell of a store that is unavailable is raised as well.
+    # They log errors of an unavailable store that are raised as well.
     for library in ("mlflow.store.db.utils", "urllib3.connectionpool"):
         logging.getLogger(library).setLevel(logging.CRITICAL)
     try:
         with warnings.catch_warnings():
-            # SQLAlchemy tells MLflow's users of MLflow's own deprecated calls.
+            # SQLAlchemy warns about deprecated calls that MLflow makes.
             warnings.simplefilter("ignore")
             yield
     except (MlflowException, SQLAlchemyError, OSError, ModuleNotFoundError) as error:
@@ -202,7 +201,7 @@ def store_errors(uri: str) -> Iterator[None]:
 
 
 def _experiment_in(store: TrackingStore, name: str, artifacts: str | None) -> str:
-    """Return the id of an experiment, which is made if there is none."""
+    """Return the ID of an experiment; create it if there is none."""
     from mlflow.exceptions import MlflowException
 
     location = Path(artifacts).absolute().as_uri() if artifacts else None
@@ -212,7 +211,7 @@ def _experiment_in(store: TrackingStore, name: str, artifacts: str | None) -> st
         try:
             experiment_id = str(store.create_experiment(name, artifact_location=location))
         except MlflowException as error:
-            # Somebody else may just have made it, or it was this one, and only the answer was lost.
+            # Another process has just created it, or this one has, and only the reply was lost.
             if error.error_code != "RESOURCE_ALREADY_EXISTS":
                 raise
             found = store.get_experiment_by_name(name)
@@ -227,7 +226,7 @@ def _experiment_in(store: TrackingStore, name: str, artifacts: str | None) -> st
 
 
 def _keep_view(store: TrackingStore, experiment_id: str, tags: Mapping[str, str]) -> None:
-    """Add the saved view of runs to an experiment, unless it exists."""
+    """Add the saved view of runs to an experiment, or replace one of another version."""
     if tags.get(VIEW_TAG) != VIEW:
         store.set_experiment_tag(experiment_id, VIEW_TAG, VIEW)
 
@@ -238,13 +237,13 @@ def check_artifacts(store: TrackingStore, experiment_id: str) -> None:
 
 
 def _check_writable(location: str | None) -> None:
-    """Raise `TrackingError` if the artifacts are files of this machine, and cannot be written."""
-    # A server is asked when it is given the first file; what it does not take stays in the folder of the run.
+    """Raise `TrackingError` if the artifacts are stored in a folder of this machine that cannot be written."""
+    # A server is only checked by the first upload; files that it refuses stay in the folder of the run.
     if location is None or not location.startswith("file:"):
         return
     folder = Path(url2pathname(urlsplit(location).path))
     try:
-        # Nothing is made, so that another mistake leaves nothing behind.
+        # Create nothing, so that a later error leaves nothing behind.
         check_writable(nearest_existing(folder) / "any")
     except OSError as error:
         raise TrackingError(

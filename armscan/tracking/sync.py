@@ -20,7 +20,7 @@ from armscan.tracking.tags import FAILURE_TAG, FOLDER_TAG
 from armscan.tracking.uploader import deliver
 from armscan.utils.log import log
 
-# Of a run: how it ended, as its outbox says it.
+# Statuses of a run that has ended, as its outbox holds them.
 ENDED = ("FINISHED", "FAILED", "KILLED")
 PROCESS_DIED, FOLDER_REMOVED = "its process died", "its process died, and its folder was removed"
 IN_USE = "it is still going on"
@@ -30,13 +30,13 @@ _looked_for: set[str] = set()
 
 @dataclass(frozen=True)
 class Delivery:
-    """Delivery of the entries of a run.
+    """Outcome of uploading the entries of a run.
 
     Args:
         folder: The run's folder.
-        run_id: MLflow run ID; None if another process holds the outbox.
-        n_entries: Number of entries delivered now.
-        left: Reason why some entries are not delivered; None if all are.
+        run_id: MLflow run ID; None if it could not be read, as when another process holds the outbox.
+        n_entries: Number of entries uploaded now.
+        left: Reason why some entries are not uploaded; None if all are.
     """
 
     folder: Path
@@ -46,7 +46,7 @@ class Delivery:
 
 
 def sync(folder: Path, opened: Callable[[str], TrackingStore], *, trust: bool = False) -> list[Delivery]:
-    """Deliver the entries of the runs in a folder and below it.
+    """Upload the pending entries of all runs in a folder, recursively.
 
     Args:
         folder: Folder of a run, of a study, or above them.
@@ -55,7 +55,7 @@ def sync(folder: Path, opened: Callable[[str], TrackingStore], *, trust: bool = 
             Default: False.
 
     Returns:
-        The delivery of each run that had something left.
+        The outcome for each run that had entries left, is in use, or has a damaged outbox.
     """
     place = folder.absolute()
     removed = [
@@ -93,13 +93,13 @@ def _synced(files: Iterable[Path], opened: Callable[[str], TrackingStore], *, tr
 
 
 def _is_abandoned(run_id: str, file: Path) -> bool:
-    """Return whether the process that kept a run's outbox in this file died on this machine."""
+    """Return whether the process that wrote this outbox of a run has died on this machine."""
     note = Note.of(run_id)
     return note is not None and note.is_abandoned and note.outbox == file.absolute()
 
 
 def _end_removed(run_id: str, opened: Callable[[str], TrackingStore]) -> str | None:
-    """End a run as FAILED whose process has died and whose folder was removed; return why that cannot be done now."""
+    """Close a run as FAILED: its process died and its folder was removed; return why the store refuses, if it does."""
     note = Note.of(run_id)
     assert note is not None
     try:
@@ -117,7 +117,7 @@ def _end_removed(run_id: str, opened: Callable[[str], TrackingStore]) -> str | N
 
 
 def _opened(opened: Callable[[str], TrackingStore], uri: str) -> TrackingStore | TrackingError:
-    """Open a store; return why it cannot be used, so that it is not waited for again with the next run."""
+    """Open a store, or return the error, so that the next run does not wait for the store again."""
     try:
         return opened(uri)
     except (TrackingError, UntrustedError) as error:
@@ -129,7 +129,7 @@ def _delivered(outbox: Outbox, store: TrackingStore, *, trust: bool) -> Delivery
     try:
         if not trust:
             _check_own(outbox, store)
-    # Any error of the store, or a run that is another's.
+    # Any error of the store, or an untrusted folder.
     except Exception as error:
         return Delivery(outbox.folder, outbox.address.run_id, 0, reason_in(error))
     for channel in CHANNELS:
@@ -142,7 +142,7 @@ def _delivered(outbox: Outbox, store: TrackingStore, *, trust: bool) -> Delivery
 
 
 def _check_own(outbox: Outbox, store: TrackingStore) -> None:
-    """Raise `UntrustedError` if a stranger's folder may name the run, which may be any of this user's."""
+    """Raise `UntrustedError` unless the run was tracked from this folder: a stranger's could name any of the user's."""
     run_id, folder = outbox.address.run_id, outbox.folder.resolve()
     note = Note.of(run_id)
     if note is not None and note.outbox == outbox.file.absolute():
@@ -156,7 +156,7 @@ def _check_own(outbox: Outbox, store: TrackingStore) -> None:
 
 
 def deliver_pending(store: TrackingStore) -> None:
-    """Deliver the entries of a store's earlier runs on this machine, in the background, once per process."""
+    """Upload what earlier runs on this machine have left for a store, in the background, once per process."""
     if store.uri not in _looked_for:
         _looked_for.add(store.uri)
         threading.Thread(target=_deliver_pending, args=(store,), name="pending", daemon=True).start()
@@ -174,7 +174,7 @@ def _deliver_pending(store: TrackingStore) -> None:
         for delivery in deliveries:
             if delivery.n_entries:
                 log(f"run {delivery.run_id}: {delivery.n_entries} entries that it had left are delivered now")
-        # Those of a run that was removed, too; one that is still going on delivers for itself.
+        # Also forget a removed run of another machine; a run that is in progress keeps its note.
         if all(delivery.left is None for delivery in deliveries) and (is_there or not note.process.is_here):
             forget(run_id)
 
@@ -198,7 +198,7 @@ def abandon(folder: Path, store: TrackingStore, reason: str) -> None:
 
 
 def note_end(folder: Path, run_id: str, uri: str, status: str, tags: Mapping[str, str]) -> None:
-    """Note how a run has ended, for `sync` to deliver, without asking its store."""
+    """Record a run's end in its outbox, for `sync` to upload, without contacting the store."""
     with contextlib.closing(Outbox.begin(folder, Address(run_id, absolute(uri)))) as outbox:
         outbox.note()
         if tags:

@@ -1,4 +1,4 @@
-"""MLflow's system metrics of the machine while a run trains, delivered like all other metrics."""
+"""MLflow's system metrics of the machine while a run trains, uploaded like all other metrics."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import threading
 from collections.abc import Callable, Mapping
 from typing import Any
 
-# As MLflow names them; its UI shows these on a page of their own.
+# MLflow's prefix; its UI shows these metrics on a page of their own.
 PREFIX = "system/"
 
 
 class SystemMetrics:
-    """A thread that looks at CPU, memory, disk, network and GPUs, every so often and once at its end.
+    """A thread that measures CPU, memory, disk, network and GPUs at regular intervals, and once at its end.
 
-    MLflow's own thread would ask the store each time, and write there itself: it ends where the store is unavailable.
+    MLflow's own thread would read from the store and write to it each time, and end once the store is unavailable.
 
     Args:
         take: Function that takes the metrics by name, and the number of the measurement, which is MLflow's step.
@@ -56,10 +56,10 @@ def _monitors() -> list[Any]:
     for kind in kinds:
         try:
             monitor = kind()
-            # That of the CPU says how busy it was since this thread has looked last.
+            # Discard the first sample: the CPU load is an average since this thread's previous measurement.
             monitor.collect_metrics()
             monitor.clear_metrics()
-        # Any error of a machine without this device, such as one without a GPU.
+        # Any error on a machine without this device, such as a GPU.
         except Exception:
             continue
         monitors.append(monitor)

@@ -1,21 +1,21 @@
 """Names of the tags of runs in MLflow."""
 
-# MLflow's own: the run that a run is shown below, and the description of a run.
+# MLflow's own tags: the parent of a run, and its description.
 PARENT_TAG, NOTE_TAG = "mlflow.parentRunId", "mlflow.note.content"
-# Absolute path of the folder of a run, and the name of the machine that has it.
+# Absolute path of a run's folder, and the name of its machine.
 FOLDER_TAG, HOST_TAG = "folder", "host"
 # Version of armscan that made a run.
 VERSION_TAG = "armscan.version"
-# Beginning of the tags with a run's choice of each group. Only trainings have them, not the runs above these.
+# Prefix of the tags with a run's choice of each configuration group. Only trainings have them, not their parent runs.
 CHOICE = "choice."
 AGENT_TAG, OBS_TAG = f"{CHOICE}agent", f"{CHOICE}obs"
 # What the agent of a run was trained on, as `armscan.training.TrainingDomain` writes it.
 DOMAIN_TAG = "trained_on"
-# Run that an evaluation is of; only evaluations have it.
+# The run that was evaluated; only evaluations have this tag.
 EVALUATED_TAG = "evaluation.of"
-# Why a run ended before its end.
+# Why a run failed or was interrupted.
 FAILURE_TAG = "failure"
-# Of the run of a job: its number. Of the run of a grid: the words that repeat it.
+# Of a job's run: its number. Of a grid's run: the arguments that repeat it.
 JOB_TAG, GRID_TAG = "job", "grid"
-# Of the runs of a study: its name and storage, the number of the trial, and whether that was pruned.
+# Of a study's runs: its name and storage, the number of the trial, and whether the trial was pruned.
 STUDY_TAG, STORAGE_TAG, TRIAL_TAG, PRUNED_TAG = "study", "study.storage", "trial", "pruned"

@@ -24,12 +24,12 @@ if TYPE_CHECKING:
     from mlflow import MlflowClient
     from mlflow.entities import DatasetInput
 
-# Of each, the class in mlflow.entities, and how many MLflow takes in one request.
+# By kind: the class in `mlflow.entities`, and how many MLflow accepts in one request.
 AT_ONCE = {"metrics": ("Metric", 1000), "params": ("Param", 100), "tags": ("RunTag", 100)}
 ENTRIES_AT_ONCE = 200
-# Of a dataset, at most 36 in MLflow.
+# Length of a dataset's digest; MLflow's limit is 36.
 DIGEST_CHARS = 16
-# MLflow's own, of the description of a run.
+# SHA-256 of the description that armscan wrote: one with another checksum was written by a person.
 NOTE_SUM_TAG = "note.sha256"
 LONGEST_PAUSE_S, LOOK_S = 5.0, 0.5
 
@@ -47,7 +47,7 @@ class Uploader:
 
     @property
     def is_unavailable(self) -> bool:
-        """Return whether the store is unavailable, as far as is known, rather than refusing entries."""
+        """Return whether the store is unavailable, as far as known, rather than refusing entries."""
         return self._failure is None or unavailable_reason(self._failure) is not None
 
     def wake(self) -> None:
@@ -126,7 +126,7 @@ def deliver(
     Args:
         outbox: Outbox of the run.
         client: Client of the run's store.
-        channel: Channel whose entries are delivered.
+        channel: Channel whose entries are uploaded.
         is_whole: Whether the run's folder is complete, so that a missing file was removed on purpose. Default: True.
         trust: Whether to upload files outside of the run's folder that another process has added. Default: False.
 
@@ -155,7 +155,7 @@ def deliver(
 
 
 def dataset_input(part: str, prints: Mapping[str, str]) -> DatasetInput:
-    """Return volumes as a dataset of MLflow; its digest follows from their fingerprints.
+    """Return volumes as an MLflow dataset, with a digest of their fingerprints.
 
     Args:
         part: Split of the volumes: `training`, `validation` or `test`.
@@ -217,7 +217,7 @@ def _deliver(client: MlflowClient, outbox: Outbox, kind: str, values: list[Any])
 
 
 def leave_note(client: MlflowClient | TrackingStore, run_id: str, text: str) -> None:
-    """Give a run a description; one that a person has written stays."""
+    """Set the description of a run, unless a person has written one."""
     text = shortened(text, MAX_TAG_CHARS, RESULTS_PAGE)
     tags = client.get_run(run_id).data.tags
     if NOTE_TAG not in tags or sha256(tags[NOTE_TAG].encode()) == tags.get(NOTE_SUM_TAG):

@@ -1,6 +1,6 @@
 """The view of an experiment's runs in MLflow: the columns that matter, and learning curves as the first charts.
 
-MLflow keeps a shared view as a tag of the experiment, and shows it where an address names its key.
+MLflow stores a shared view as a tag of the experiment, and shows it if the URL names its key.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ CURVES = {
     "validation/mean_steps": "steps, mean",
 }
 SECTION = "learning-curves"
-# Of a heading.
+# Width of a letter in a column heading, and of the space around the heading.
 LETTER_PX, AROUND_PX = 6, 40
 
 
 def artifact_address(run_id: str, file: str) -> str:
-    """Return the address of an artifact of a run, relative to the pages of MLflow's UI."""
+    """Return the address of a run's artifact, relative to the pages of MLflow's UI."""
     return f"get-artifact?path={file}&run_uuid={run_id}"
 
 
 def _line(metric: str, title: str) -> dict[str, object]:
-    """Return a chart of a metric by environment step, as MLflow describes it."""
+    """Return MLflow's description of a line chart of a metric by environment step."""
     return {
         "type": "LINE",
         "uuid": f"{SECTION}-{metric.rpartition('/')[2]}",

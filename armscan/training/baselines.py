@@ -1,6 +1,6 @@
-"""Baselines of an agent: random planes, and a sweep from the middle outward, on the same volumes and rules.
+"""Baselines for an agent: random planes, and a sweep from the middle outward, on the same volumes and rules.
 
-Their episodes are kept in the machine's cache, because many runs have the same volumes and rules.
+Their episodes are cached on the machine, because many runs have the same volumes and rules.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from armscan.training.fingerprints import fingerprint
 from armscan.utils.files import atomic_write, cache_folder
 
 FOLDER = "baselines"
-# What decides how an episode goes, beside the agent.
+# Code that determines how the episodes of the baselines go.
 SOURCES = ("agents/baselines.py", "training/episodes.py", "volumes/**/*.py", "anatomy/**/*.py", "envs/**/*.py")
 RANDOM = "random"
 
@@ -61,7 +61,7 @@ def evaluate_baselines(
 
 
 def _rules_of(rules: Rules) -> str | None:
-    """Return all that episodes depend on beside the agent; None if classes of others have a part in it."""
+    """Return all that episodes depend on besides the agent; None if it includes classes that are not armscan's."""
     parts = (rules.reward, *rules.tissues, *([rules.transform] if rules.transform else []))
     if not all(type(part).__module__.startswith("armscan.") for part in parts):
         return None
@@ -72,7 +72,7 @@ def _rules_of(rules: Rules) -> str | None:
 
 @cache
 def _sources() -> str:
-    """Return the fingerprint of the code that plays episodes: changed code never meets old episodes."""
+    """Return the checksum of the code that plays episodes, so that changed code does not reuse old ones."""
     folder, digest = Path(armscan.__file__).parent, hashlib.sha256()
     for file in sorted(file for pattern in SOURCES for file in folder.glob(pattern)):
         digest.update(file.read_bytes())
@@ -88,13 +88,13 @@ def _kept(file: Path) -> Evaluation | None:
     try:
         return Evaluation.of_plain(json.loads(file.read_bytes()))
     except (OSError, ValueError):
-        # Not there, or damaged: the episodes can always be played again.
+        # Missing or damaged: the episodes are played again.
         return None
 
 
 def _keep(evaluation: Evaluation, file: Path) -> None:
     text = json.dumps([asdict(episode) for episode in evaluation.episodes]).encode()
-    # A cache that cannot be written costs seconds, and no result.
+    # A cache that cannot be written only costs time.
     with contextlib.suppress(OSError):
         file.parent.mkdir(parents=True, exist_ok=True)
         atomic_write(file, lambda opened: opened.write(text))

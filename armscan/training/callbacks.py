@@ -16,10 +16,10 @@ class EpochReport:
     Args:
         epoch: Number of the epoch, from 1.
         n_env_steps: Environment steps taken so far.
-        wall_s: Seconds of training so far, without the time between an interruption and a resumption.
+        wall_s: Seconds of training so far, without the time between an interruption and its resumption.
         metrics: Means of the epoch's training metrics, by name.
         evaluation: Evaluation on the validation volumes.
-        is_best: Whether no earlier epoch was as good.
+        is_best: Whether the epoch is better than all before it.
     """
 
     epoch: int
@@ -43,7 +43,7 @@ class Callback(Protocol):
 
         Args:
             total_env_steps: Environment steps that training may take.
-            earlier: Epochs before the interruption of a resumed training; they may be reported a second time.
+            earlier: Epochs before the interruption of a resumed training; some may have been reported already.
         """
 
     def on_epoch(self, report: EpochReport) -> None:

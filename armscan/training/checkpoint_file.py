@@ -1,6 +1,6 @@
 """Checkpoints: written whole or not at all, verified on reading, read without running code from the file.
 
-A file is one line, `armscan checkpoint FORMAT SHA-256`, and after it what `torch.save` writes, whose sum that is.
+A file is one line, `armscan checkpoint FORMAT SHA-256`, followed by the output of `torch.save`, whose SHA-256 it is.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ def save_checkpoint(path: Path, state: dict[str, Any], facts: dict[str, Any]) ->
     """Write a checkpoint; a reader sees the old one or the new one, never half of one.
 
     Args:
-        path: Place of the file.
+        path: File to write.
         state: State of the learner.
         facts: Numbers and strings to keep beside the state, such as the number of steps.
     """
     import torch
 
     def write(file: BinaryIO) -> None:
-        # Summed up from the file, so that a large replay buffer is never in memory as one file beside itself.
+        # Computed from the written file, so that a large replay buffer is not in memory twice.
         start = file.write(_header("0" * 64))
         torch.save({"state": state, "facts": facts}, file)
         file.flush()
@@ -50,7 +50,7 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         The learner's state, and the facts beside it.
 
     Raises:
-        CheckpointError: If the file is missing, damaged, of a newer armscan, or something else.
+        CheckpointError: If the file is missing, damaged, written by a newer armscan, or not a checkpoint.
     """
     import torch
 
@@ -96,7 +96,7 @@ def _header(digest: str) -> bytes:
 
 
 def _verified(file: io.BufferedReader, path: Path) -> BinaryIO:
-    """Return the contents after the first line, whose sum is the one that the line names."""
+    """Return the contents after the first line, after verifying them against its SHA-256."""
     header = file.readline(len(_header("0" * 64)) + 8)
     if (match := HEADER.fullmatch(header)) is None:
         if not header:
@@ -115,7 +115,7 @@ def _verified(file: io.BufferedReader, path: Path) -> BinaryIO:
 
 
 class _After(io.RawIOBase):
-    """An open file from a place on, as if it began there; torch counts places from a file's beginning."""
+    """An open file from an offset on, as if it began there; torch counts positions from a file's beginning."""
 
     def __init__(self, file: io.BufferedReader, offset: int) -> None:
         super().__init__()

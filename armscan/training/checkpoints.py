@@ -52,7 +52,7 @@ class CheckpointProvenance:
 def save_checkpoints(
     learner: Learner, reports: Sequence[EpochReport], folder: Path, provenance: CheckpointProvenance | None
 ) -> None:
-    """Write the last checkpoint, and the best one where the last epoch is better than all before."""
+    """Write the last checkpoint, and the best one if the last epoch is better than all before."""
     _save_last(learner, reports, folder, provenance)
     if reports[-1].is_best:
         save_checkpoint(folder / BEST_CHECKPOINT, learner.weights(), _facts(reports[-1], provenance))
@@ -79,10 +79,10 @@ def resume_from_checkpoint(learner: Learner, folder: Path, provenance: Checkpoin
     reports = _restore(learner, last, provenance)
     best_report = best_of(reports)
     if best_report is reports[-1]:
-        # A kill may have come before this was written.
+        # A kill may have prevented this write.
         save_checkpoint(best, learner.weights(), _facts(best_report, provenance))
         return reports
-    # Better refused now than when the training is done.
+    # Better refused now than after the training.
     best_facts = load_checkpoint(best)[1]
     provenance.check(best, best_facts)
     if best_facts.get("epoch") != best_report.epoch:
@@ -95,7 +95,7 @@ def resume_from_checkpoint(learner: Learner, folder: Path, provenance: Checkpoin
 def take_over_checkpoints(
     learner: Learner, source: Path, folder: Path, *, theirs: CheckpointProvenance, own: CheckpointProvenance
 ) -> list[EpochReport]:
-    """Restore a learner to the state of another training's last checkpoint, and keep its checkpoints as its own.
+    """Restore a learner to another training's last checkpoint, and save its checkpoints as this training's own.
 
     Args:
         learner: Learner that has learned nothing yet.
@@ -116,7 +116,7 @@ def take_over_checkpoints(
     reports = _restore(learner, source / LAST_CHECKPOINT, theirs)
     best_report = best_of(reports)
     save_checkpoint(folder / BEST_CHECKPOINT, weights, _facts(best_report, own))
-    # Last: from then on this training can be resumed.
+    # Last, because from then on this training can be resumed.
     _save_last(learner, reports, folder, own)
     return reports
 
@@ -149,7 +149,7 @@ def _facts(report: EpochReport, provenance: CheckpointProvenance | None) -> dict
 
 
 def _written(reports: Sequence[EpochReport]) -> str:
-    """Return reports as a string, which takes a checkpoint's reader no time; JSON keeps every digit of a number."""
+    """Return reports as a JSON string, which loads fast from a checkpoint and keeps every digit of a number."""
     return json.dumps(
         [
             {
@@ -166,7 +166,7 @@ def _read(text: Any, path: Path) -> list[EpochReport]:
     try:
         reports = []
         for record in json.loads(text):
-            # Earlier versions have kept no limits.
+            # Checkpoints of earlier versions have no limits.
             evaluation = Evaluation.of_columns(record.pop("episodes"), record.pop("on_plane", ON_PLANE))
             reports.append(EpochReport(**record, evaluation=evaluation))
         # One of them is the best.

@@ -16,7 +16,7 @@ from armscan.errors import InvalidValueError
 from armscan.training.episode_results import Env
 from armscan.volumes import LabelVolume
 
-# By which share a size may lie outside the range of the training volumes without a word about it.
+# Share by which a size may lie outside the range of the training volumes without a note.
 USUAL_DIFFERENCE = 0.1
 MAX_SHOWN_CHARS = 100
 Range = tuple[float, float]
@@ -24,7 +24,7 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class TrainingDomain:
-    """Observations of environments on some volumes, and the range of the volumes' sizes.
+    """Shapes of observations on some volumes, and the range of the volumes' sizes.
 
     Args:
         observed: Shape of each part of an observation; a single vector has the name `vector`.
@@ -84,7 +84,7 @@ class TrainingDomain:
                 )
 
     def differences(self, other: TrainingDomain) -> list[str]:
-        """Return the differences that an agent meets on other volumes, in a sentence each."""
+        """Return the differences that an agent meets on other volumes, one sentence each."""
         notes = []
         for what, here, there, means in (
             ("a pixel", self.pixel_mm, other.pixel_mm, "images and plain cluster numbers are of another scale"),
@@ -102,15 +102,15 @@ class TrainingDomain:
 
 
 def smallest_slice(volumes: Collection[LabelVolume]) -> tuple[int, int]:
-    """Return the shape that the slices of all volumes have at least, (across, depth) in pixels."""
+    """Return the largest shape that fits into the slices of all volumes, (across, depth) in pixels."""
     return min(v.slice_shape[0] for v in volumes), min(v.slice_shape[1] for v in volumes)
 
 
 def with_crops(rules: Any, trained: tuple[int, int], here: tuple[int, int]) -> Any:
-    """Return the configuration of an observation with images cropped as those that an agent was trained on.
+    """Return the configuration of an observation with images cropped as in an agent's training.
 
-    Without a crop in the configuration, images have the smallest slice of the volumes at hand, which differs between
-    data sets. Images that are resized to one shape keep that rule if slices are smaller.
+    Without a crop in the configuration, images are cropped to the smallest slice of the environment's volumes, which
+    differs between data sets. Images that are resized to one shape keep that rule if slices are smaller.
 
     Args:
         rules: Configuration as plain dictionaries and lists, or the name of an observation.
@@ -124,7 +124,7 @@ def with_crops(rules: Any, trained: tuple[int, int], here: tuple[int, int]) -> A
 
 
 def _spelled_out(rules: Any) -> Any:
-    """Return the configuration of an observation with images that are named in it written in full."""
+    """Return the configuration of an observation with the names of image observations written out in full."""
     named = NAMED_OBSERVATIONS.get(rules) if isinstance(rules, str) else None
     if named and "crop" in inspect.signature(named).parameters:
         return {"_target_": f"armscan.envs.{named.__name__}", "crop": None, "shape": None}

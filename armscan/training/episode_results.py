@@ -16,15 +16,15 @@ from armscan.errors import InvalidValueError
 from armscan.stats.on_plane import ON_PLANE, OnPlane, check_on_plane
 from armscan.utils.arrays import FloatArray
 
-# What evaluations are called by, after the volumes that they are on.
+# Names of evaluations, after their volumes.
 TRAINING, VALIDATION, TEST = "training volumes", "validation volumes", "test volumes"
 
 SUCCESS, DISTANCE = BEST_BY = ("success", "distance")
 
-# Above any number of an episode; sums of such are finite.
+# Bound on the numbers of an episode, whose sums are then finite.
 LARGEST = 1e100
 
-# Means over episodes, by name, and what of an episode each is of.
+# Means over episodes, by name, and the value of an episode that each averages.
 MEANS = {
     "success_rate": "is_success",
     "mean_steps": "n_steps",
@@ -52,20 +52,20 @@ class EpisodeResult:
         episode_return: Sum of the rewards.
         final_reward: Reward of the last plane.
         best_reward: Best reward of the chosen planes, without the start.
-        distance_mm: Distance of the last plane from the optimal one, in mm.
-        distance_deg: Angle between the last plane and the optimal one, in degrees.
-        dice_bones: Dice coefficient of the bones on the last slice and on the optimal plane's slice, in [0, 1]; see
+        distance_mm: Distance of the last plane from the labelled one, in mm.
+        distance_deg: Angle between the last plane and the labelled one, in degrees.
+        dice_bones: Dice coefficient of the bones on the last slice and on the labelled plane's slice, in [0, 1]; see
             `tissue_dice`.
         dice_tendons: Dice coefficient of the tendons, in [0, 1].
         dice_artery: Dice coefficient of the artery, in [0, 1].
         seconds_per_plane: Mean wall time of choosing a plane and slicing it, in seconds; an equal share for each of
             several episodes side by side. Not compared by `==`.
-        nerve_area_error_mm2: Absolute error of the median nerve's area on the last slice against that on the optimal
-            plane's, in mm². Default: None, not measured, or no nerve on the optimal plane's slice.
-        nerve_area_error_percent: The same in per cent of the area on the optimal plane's slice. Default: None, as
-            above.
-        expected_mm: Error that the agent expects of its last plane, in mm. Default: None, it expects none.
-        expected_deg: Error that the agent expects of its last plane, in degrees. Default: None, it expects none.
+        nerve_area_error_mm2: Absolute error of the median nerve's area on the last slice against the labelled plane's,
+            in mm². Default: None, not measured, or no nerve on the labelled plane's slice.
+        nerve_area_error_percent: The same error as a percentage of the area on the labelled plane's slice. Default:
+            None, as above.
+        expected_mm: Error of the last plane that the agent predicts, in mm. Default: None, it predicts none.
+        expected_deg: Error of the last plane that the agent predicts, in degrees. Default: None, it predicts none.
     """
 
     volume: str
@@ -95,7 +95,7 @@ class EpisodeResult:
 
 EPISODE_FIELDS = tuple(each.name for each in fields(EpisodeResult))
 KINDS = get_type_hints(EpisodeResult)
-# Older evaluations have nothing of the nerve, nor of what is expected.
+# Older evaluations lack these fields.
 OPTIONAL = {each.name for each in fields(EpisodeResult) if each.default is None}
 
 
@@ -114,11 +114,11 @@ class Evaluation:
 
     @classmethod
     def of_plain(cls, episodes: object, on_plane: object = ON_PLANE) -> Self:
-        """Return the evaluation of episodes that were read from JSON, as `to_dict` has given them.
+        """Return the evaluation of episodes that were read from JSON, as `to_dict` returned them.
 
         Args:
             episodes: Episodes as plain values, in a list.
-            on_plane: Limits as pairs of mm and degrees. Default: those of evaluations that have kept none.
+            on_plane: Limits as pairs of mm and degrees. Default: `ON_PLANE`, as for evaluations without limits.
 
         Raises:
             InvalidValueError: If they are not a list, or one of them is not an episode: a value is missing, unknown, or
@@ -130,9 +130,9 @@ class Evaluation:
 
     @classmethod
     def pooled(cls, evaluations: Sequence[Evaluation]) -> Self:
-        """Return the episodes of evaluations together, one at least, with the limits of the first.
+        """Return the episodes of one or more evaluations together, with the limits of the first.
 
-        Every volume counts alike: of one on which more episodes were played than on another, the first ones are kept.
+        All volumes count equally: of each, only the first episodes are kept, as many as the least played volume has.
         """
         n_played = Counter(episode.volume for each in evaluations for episode in each.episodes)
         n_kept, n_seen = min(n_played.values(), default=0), Counter[str]()
@@ -145,17 +145,17 @@ class Evaluation:
 
     @classmethod
     def of_dict(cls, contents: Mapping[str, Any]) -> Self:
-        """Return the evaluation that `to_dict` has given; see `of_plain`."""
+        """Return the evaluation that `to_dict` was called on; see `of_plain`."""
         return cls.of_plain(contents["episodes"], contents.get("on_plane", ON_PLANE))
 
     @classmethod
     def of_columns(cls, columns: Mapping[str, Sequence[Any]], on_plane: object = ON_PLANE) -> Self:
-        """Return the evaluation that `columns` was of; see `of_plain`."""
+        """Return the evaluation that `columns` was called on; see `of_plain`."""
         rows = zip(*columns.values(), strict=True)
         return cls.of_plain([dict(zip(columns, row, strict=True)) for row in rows], on_plane)
 
     def columns(self) -> dict[str, list[Any]]:
-        """Return each value of the episodes as a list, by its name, which takes less room than the episodes."""
+        """Return a list of each field over all episodes, by name, which takes less space than the episodes."""
         return {name: [getattr(episode, name) for episode in self.episodes] for name in EPISODE_FIELDS}
 
     @property
@@ -228,7 +228,7 @@ def _episode_of(plain: object) -> EpisodeResult:
         if name in OPTIONAL and value is None:
             continue
         kind = float if name in OPTIONAL else KINDS[name]
-        # A truth value is a number to Python; JSON writes some floats as integers.
+        # In Python a bool is an int; JSON writes some floats as integers.
         is_of_kind = type(value) is kind or (kind is float and type(value) is int)
         if not is_of_kind or (kind in (int, float) and not -LARGEST < value < LARGEST):
             raise InvalidValueError(f"an episode's {name} is {value!r}, but it must be a finite {kind.__name__}")

@@ -22,7 +22,7 @@ from armscan.stats.on_plane import ON_PLANE, OnPlane
 from armscan.training.episode_results import Env, EpisodeResult, Evaluation
 from armscan.utils.validation import check_int
 
-# Episodes that are played side by side; more would hardly be faster, and each holds what it observes.
+# Most episodes side by side; more would hardly be faster, and each keeps its observations in memory.
 MAX_SIDE_BY_SIDE = 64
 
 
@@ -31,7 +31,7 @@ def evaluate(
 ) -> Evaluation:
     """Play episodes on each of the environment's volumes in turn, many of them side by side.
 
-    Each is, bit for bit, the episode that `play` plays.
+    Each equals, bit for bit, the episode that `play` plays.
 
     Args:
         agent: Agent to evaluate. Each episode is played by a copy of it, unless it is a `BatchAgent`.
@@ -55,7 +55,7 @@ def _play_all(
     """Play episodes on the named volumes with the seeds beside them, at most one in each environment."""
     bare = envs.unwrapped
     assert isinstance(bare, ArmscanVectorEnv)
-    # What wrappers require; the rest is known of the episodes.
+    # Only what the wrappers require; the rest comes from the episodes.
     bare.info_keys = ("action", "reward")
     names, seeds = [name for name, _ in planned], [seed for _, seed in planned]
     n_idle = envs.num_envs - len(planned)
@@ -74,7 +74,7 @@ def _play_all(
         seconds[running] += (time.perf_counter() - start_s) / running.size
         goes_on = ~(terminated | truncated)
         observations, rewards, running = rows_of(observations, goes_on), rewards[goes_on], running[goes_on]
-    # Of agents that say how far off they expect to be.
+    # Only some agents predict their errors.
     expected = getattr(agent, "expected_errors", np.full((len(planned), 2), None)).tolist()
     return [_result(*each) for each in zip(episodes, seeds, seconds.tolist(), expected, strict=True)]
 
@@ -107,15 +107,15 @@ def play(
 
 
 def _result(episode: Episode, seed: int, seconds: float, expected: Sequence[float | None]) -> EpisodeResult:
-    """Return how an episode went that has ended.
+    """Return the result of a finished episode.
 
     Args:
         episode: Finished episode.
         seed: Seed of its reset.
         seconds: Wall time of all its steps, in seconds.
-        expected: Errors that the agent expects of its last plane, in mm and degrees, or None and None.
+        expected: Errors of the last plane that the agent predicts, in mm and degrees, or None and None.
     """
-    # The first is the start's.
+    # The first reward is the start's.
     _, *rewards = episode.rewards
     distance_mm, distance_deg = episode.distance
     shown = episode.view.slice_xz, episode.optimal_xz

@@ -37,7 +37,7 @@ def fingerprints_in(record: bytes | Any, where: str) -> Fingerprints:
 
 
 def check_unchanged(then: Mapping[str, Mapping[str, str]], now: Mapping[str, Mapping[str, str]], those_of: str) -> None:
-    """Raise `ChangedVolumesError` if a volume is new, gone, changed or in another split than `those_of`."""
+    """Raise `ChangedVolumesError` if a volume is new, gone, changed or in another split; the message has `those_of`."""
     for part, prints in now.items():
         before = then.get(part, {})
         changes = {

@@ -1,8 +1,8 @@
-"""A result in two sentences: on the plane or not, better than random planes or not, and how far off.
+"""A result in a few sentences: its on-plane rate, whether it beats random planes, and its distance from the plane.
 
-The difference from the random agent is paired: the rates of each volume are compared, so that a volume that is easy
+The difference from the random agent is paired: the rates on each volume are compared, so that a volume that is easy
 for both does not hide what the agent adds. Its interval is for other volumes and, with several trainings, other seeds.
-If all volumes differ alike, it is Newcombe's, which takes episodes as independent.
+If the difference is the same on all volumes, the interval is Newcombe's, which takes episodes as independent.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from armscan.training.metric_display import interval_text
 from armscan.training.metrics import MetricEstimates
 from armscan.utils.rate_text import formatted
 
-# Difference of the leading on-plane rates, among the figures of an agent.
+# Metric of an agent: difference of its leading on-plane rate from random planes'.
 ABOVE_RANDOM = "on_plane_above_random"
-# Rates that differ alike on all volumes have no interval but for rounding.
+# If the difference is the same on all volumes, only rounding gives its interval a width.
 NO_WIDTH = 1e-9
 DISTANCES = (("median_distance_mm", "{:.1f} mm"), ("median_distance_deg", "{:.1f}°"))
 
@@ -30,7 +30,7 @@ DISTANCES = (("median_distance_mm", "{:.1f} mm"), ("median_distance_deg", "{:.1f
 def beside_random(
     figures: MetricEstimates, trainings: Sequence[Evaluation], random: Evaluation | None
 ) -> MetricEstimates:
-    """Return figures with the paired difference of the leading on-plane rate to that of random planes.
+    """Return figures with the paired difference of the leading on-plane rate from random planes'.
 
     Args:
         figures: Figures of an agent.
@@ -54,11 +54,11 @@ def beside_random(
 
 
 def headline(results: Mapping[str, MetricEstimates], randoms: Mapping[str, MetricEstimates]) -> str:
-    """Return the leading figures of a result; of several, of the one with the highest on-plane rate.
+    """Return the leading figures of a result, or of the one of several with the highest on-plane rate.
 
     Args:
         results: Figures of agents, by their names.
-        randoms: Figures of random planes on the same volumes, by the names of `results`; of some there may be none.
+        randoms: Figures of random planes on the same volumes, by the names of `results`; some may be missing.
 
     Returns:
         Sentences such as `On plane, 5 mm 10°: agent 73.5% (61.0–85.0), random 56.5% (46.0–66.5). Better than random:
@@ -70,7 +70,7 @@ def headline(results: Mapping[str, MetricEstimates], randoms: Mapping[str, Metri
         return ""
     name = max(known, key=lambda each: known[each].estimates[limits.metric].value)
     best, random = known[name], randoms.get(name)
-    # The highest of several is too high by chance.
+    # The highest of several is optimistically biased.
     which = f"best of {len(known)} on these very volumes, {name}," if len(known) > 1 else name
     beside = "" if random is None else f", random {_text(random.estimate(limits.metric), '{:.1%}')}"
     far = ", ".join(_text(best.estimates[metric], form) for metric, form in DISTANCES if metric in best.estimates)
@@ -93,7 +93,7 @@ def _rates(evaluation: Evaluation) -> dict[str, float]:
 
 
 def _verdict(above: Estimate | None) -> str:
-    """Return whether an agent is better than random planes, as the interval of the difference says."""
+    """Return whether an agent is better than random planes, judged by the interval of the difference."""
     if above is None or math.isnan(above.value):
         return ""
     points = Estimate(*(100 * each for each in above))

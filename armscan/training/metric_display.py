@@ -27,7 +27,7 @@ class Quantity(NamedTuple):
 
     @property
     def heading(self) -> str:
-        """The title in two lines, as the cells of a table are."""
+        """The title in two lines, like the cells of a table."""
         return self.title.replace(", ", ",\n", 1)
 
 
@@ -45,7 +45,7 @@ QUANTITIES = (
     Quantity("iqm_steps", "steps, IQM", "{:.2f}"),
     *(Quantity(f"mean_dice_{name}", f"Dice {name}, mean", "{:.2f}") for name in LANDMARKS),
 )
-# Of runs by older versions, which have kept nothing better.
+# Metrics of older runs, shown only if the metric that replaced each is missing.
 OLDER = {
     Quantity("mean_distance_mm", "distance mm, mean", "{:.1f}"): "median_distance_mm",
     Quantity("mean_distance_deg", "angle °, mean", "{:.1f}"): "median_distance_deg",

@@ -16,14 +16,14 @@ from armscan.training.episode_results import MEANS, EpisodeResult, Evaluation
 
 # Suffix of metrics over the episodes that did not start solved, and of rates with Wilson's interval.
 NOT_STARTED_SOLVED, WILSON = "_not_started_solved", "_wilson"
-# Suffixes of errors of the episodes that an agent was surest, and least sure of.
+# Suffixes of errors over the episodes with the smallest and with the largest expected errors.
 SUREST, MIN_SURE = "_surest_quarter", "_least_sure_quarter"
 # Suffixes of the ends of an interval, and the names of the counts.
 ENDS = ("_low", "_high")
 COUNTS = ("volumes", "episodes", "episodes_started_solved")
 MEDIAN, P90, P95 = quantile(0.5), quantile(0.9), quantile(0.95)
 
-# By name, the statistic, and what of an episode it is of.
+# Metrics by name: the statistic, and the value of an episode that it summarises.
 METRICS: dict[str, tuple[Statistic, str]] = {
     **{name: (mean, value) for name, value in MEANS.items()},
     "iqm_steps": (interquartile_mean, "n_steps"),
@@ -43,15 +43,15 @@ METRICS: dict[str, tuple[Statistic, str]] = {
 
 @dataclass(frozen=True)
 class MetricEstimates:
-    """Sums and means over some episodes.
+    """Metrics over some episodes, with their intervals.
 
     Args:
         n_seeds: Number of trainings that they summarise.
         n_volumes: Number of volumes that they summarise.
         n_episodes: Number of episodes.
         n_started_solved: Number of episodes that started on a rewarded plane.
-        estimates: Metrics by name, over all episodes. Names that end with `_not_started_solved` are over the others
-            only; names that end with `_wilson` are rates with Wilson's interval.
+        estimates: Metrics by name, over all episodes. Those whose names end with `_not_started_solved` are over the
+            others only; those that end with `_wilson` are rates with Wilson's interval.
         on_plane: Limits of the on-plane rates, the leading ones first.
     """
 
@@ -64,7 +64,7 @@ class MetricEstimates:
 
     @classmethod
     def of(cls, evaluation: Evaluation, trainings: Sequence[Hashable] | None = None) -> MetricEstimates:
-        """Compute them; the same episodes give the same intervals.
+        """Compute the metrics; the same episodes give the same intervals.
 
         Args:
             evaluation: Episodes to summarise.
@@ -79,7 +79,7 @@ class MetricEstimates:
         columns: dict[str, tuple[Statistic, list[float]]] = {name: (mean, values) for name, values in rates.items()}
         for name, (statistic, value) in METRICS.items():
             measured = [getattr(episode, value) for episode in episodes]
-            # What was never measured is no figure.
+            # Skip what was never measured.
             if any(each is not None for each in measured) or not measured:
                 columns[name] = statistic, [math.nan if each is None else float(each) for each in measured]
         columns |= _by_expected_error(episodes)
@@ -101,7 +101,7 @@ class MetricEstimates:
 
     @classmethod
     def of_trainings(cls, evaluations: Mapping[Any, Evaluation]) -> MetricEstimates:
-        """Compute them over the episodes of several trainings.
+        """Compute the metrics over the episodes of several trainings.
 
         Args:
             evaluations: Episodes of each training, by its name; one training or more.
@@ -113,7 +113,7 @@ class MetricEstimates:
 
     @classmethod
     def of_metrics(cls, metrics: Mapping[str, float], *, n_seeds: int = 1) -> MetricEstimates:
-        """Return estimates from the numbers of `metrics` or of a run; without an interval if there is none.
+        """Return estimates from the numbers of `metrics` or of a run; without an interval if its ends are missing.
 
         Args:
             metrics: Numbers by the name of the metric.
@@ -138,7 +138,7 @@ class MetricEstimates:
         return self._metrics(self.estimates)
 
     def shown_metrics(self, names: Iterable[str]) -> dict[str, float]:
-        """Return the numbers of these figures likewise, as they are shown."""
+        """Return the numbers of these figures as they are shown; see `metrics`."""
         return self._metrics({name: self.estimate(name) for name in names})
 
     def _metrics(self, estimates: Mapping[str, Estimate]) -> dict[str, float]:
@@ -150,7 +150,7 @@ class MetricEstimates:
 
 
 def _by_expected_error(episodes: Sequence[EpisodeResult]) -> dict[str, tuple[Statistic, list[float]]]:
-    """Return errors of the quarters of the episodes that the agent was surest and least sure of, if it expects some."""
+    """Return the errors over the quarters of episodes with the smallest and largest expected errors; {} if unknown."""
     columns: dict[str, tuple[Statistic, list[float]]] = {}
     for unit in ("mm", "deg"):
         expected = [getattr(episode, f"expected_{unit}") for episode in episodes]

@@ -19,7 +19,7 @@ from armscan.utils.rate_text import PERCENT, formatted
 
 
 def progress_reporter(label: str | None = None, measured: str = "validation") -> Callback:
-    """Return a progress bar on a terminal; elsewhere, or with the label of a job, one line an epoch.
+    """Return a progress bar on a terminal; elsewhere, or with the label of a job, one line per epoch.
 
     Args:
         label: Label of the job. Default: None, a single run.
@@ -29,7 +29,7 @@ def progress_reporter(label: str | None = None, measured: str = "validation") ->
 
 
 class _Narrower(Progress):
-    """A bar that leaves the terminal's last columns free: the echo of a Ctrl-C would begin another line there."""
+    """A bar that leaves the terminal's last columns free: the echo of Ctrl-C would wrap to the next line there."""
 
     def get_renderable(self) -> RenderableType:
         """Return the bar, narrower than the terminal."""
@@ -55,7 +55,7 @@ class ProgressBar:
         )
 
     def on_start(self, total_env_steps: int, earlier: Sequence[EpochReport]) -> None:
-        """Show the bar, at the last epoch of a training that is resumed."""
+        """Show the bar, from the last epoch of a resumed training on."""
         self._task = self._progress.add_task("training", total=total_env_steps, metrics="")
         for report in earlier[-1:]:
             self.on_epoch(report)
@@ -78,7 +78,7 @@ class ProgressLines:
         self._label, self._measured = f"[{label}] " if label else "", measured
 
     def on_start(self, total_env_steps: int, earlier: Sequence[EpochReport]) -> None:
-        """Print how long the training is."""
+        """Print the budget of the training."""
         self._total = total_env_steps
         self._start_s = time.perf_counter() - (earlier[-1].wall_s if earlier else 0.0)
         after = f", {earlier[-1].n_env_steps} of them taken" if earlier else ""

@@ -1,7 +1,7 @@
 """The table of results, with the same figures and names everywhere.
 
 Every figure is over all episodes, failed ones included, with its 95 % interval, and its name says which statistic it
-is. The share of episodes that end on the labelled plane leads: the reward also accepts planes far from it.
+is. The on-plane rate comes first, because the reward also accepts planes far from the labelled one.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from armscan.training.metrics import MetricEstimates
 from armscan.utils.markdown import markdown_table
 from armscan.utils.rate_text import formatted
 
-# The most results that stand side by side; more of them are lines of their own.
+# Most results that are columns side by side; of more, each is a line.
 MAX_ABREAST = 6
-# Between two cells.
+# Characters between two columns.
 PADDING_CHARS = 2
 MISSING = "–"
 HOW = (
@@ -132,13 +132,13 @@ class ResultTable:
             columns[column.metric] = column.heading, cells
         for title, count in COUNTS.items():
             columns[count] = title.replace(" ", "\n"), [_count(each, count) for each in self.results.values()]
-        # Those that matter most first; sorting leaves the others in their order.
+        # Leading columns first; sorting keeps the order of the others.
         leading = (next(iter(columns)), *LEADING)
         by_need = sorted(columns, key=lambda name: leading.index(name) if name in leading else len(leading))
         wanted = [columns[name] for name in by_need]
         legend: list[Text] = []
         if self.facts and _fitting(width, names, wanted) < min(len(leading), len(wanted)):
-            # In lines of their own: figures need the columns.
+            # On lines of their own, because the figures need the width.
             facts = zip(self.results, *self.facts.values(), strict=True)
             legend = [Text(f"{name}: {', '.join(filter(None, told))}") for name, *told in facts if any(told)]
             names = names[:1]
@@ -163,7 +163,7 @@ def with_baselines(
     of_figures: dict[tuple[str, str], list[str]] = {}
     for result, ours in baselines.items():
         for name, figures in ours.items():
-            # Times, which are never the same twice, are not shown.
+            # Compares what is shown: times, which always differ, are not.
             shown = [figures.estimate(column.metric) for column in ResultTable({name: figures}).quantities]
             of_figures.setdefault((name, repr(shown)), []).append(result)
     below = {}

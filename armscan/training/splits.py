@@ -13,7 +13,7 @@ from armscan.volumes import LabelVolume, load_phantoms, open_dataset
 from armscan.volumes.dataset import SPLITS
 from armscan.volumes.phantom import VERSIONS
 
-# No phantom of one purpose has the seed of another.
+# Phantoms of different splits never have the same seed.
 VALIDATION_FIRST_SEED, TEST_FIRST_SEED = 1_000_000, 2_000_000
 
 PARTS = ("training", "validation", "test")
@@ -25,8 +25,8 @@ class Split:
 
     Args:
         training: Volumes that the agent learns on.
-        validation: Volumes of the validation after each epoch, which choose the checkpoint and stop the training.
-        test: Volumes of the final evaluation, which have no part in training.
+        validation: Volumes of the validation after each epoch, which chooses the checkpoint and stops the training.
+        test: Volumes of the final evaluation, which are not used in training.
 
     Raises:
         InvalidValueError: If one of the three has no volume, or two have the same.
@@ -73,12 +73,12 @@ def phantom_data(
     cache_dir: str | None = None,
     version: int = 1,
 ) -> Split:
-    """Make phantom wrists; validation and test have seeds that no training phantom has.
+    """Make phantom wrists, with different seeds for training, validation and test.
 
     Args:
         n_training: Number of phantoms to train on, 1 or more. Default: 16.
-        n_validation: Number of phantoms that choose the checkpoint, 1 or more. Default: 4.
-        n_test: Number of phantoms of the final evaluation, 1 or more. Default: 8.
+        n_validation: Number of validation phantoms, 1 or more. Default: 4.
+        n_test: Number of test phantoms, 1 or more. Default: 8.
         first_seed: Seed of the first training phantom, 0 or more; the next ones follow. Default: 0.
         cache_dir: Folder that keeps phantoms. Default: None, the user's cache folder.
         version: Version of the phantoms, 1 or 2; see `make_phantom`. Default: 1, as in runs that name none.
@@ -153,22 +153,22 @@ def mixed_data(
     Args:
         path: Folder of the volumes.
         n_volumes: Number of its volumes to use, the first by name, 1 or more. Default: None, all.
-        n_training: Number of phantoms to train on beside the volumes, 0 or more. Default: 16.
-        n_validation: Number of phantoms that choose the checkpoint, with `validation=phantoms`, 1 or more. Default: 4.
-        n_test: Number of phantoms of the final evaluation, with `test=phantoms`, 1 or more. Default: 8.
+        n_training: Number of training phantoms besides the volumes, 0 or more. Default: 16.
+        n_validation: Number of validation phantoms, with `validation=phantoms`, 1 or more. Default: 4.
+        n_test: Number of test phantoms, with `test=phantoms`, 1 or more. Default: 8.
         first_seed: Seed of the first training phantom, 0 or more; the next ones follow. Default: 0.
         cache_dir: Folder that keeps phantoms. Default: None, the user's cache folder.
         version: Version of the phantoms; see `phantom_data`. Default: 1.
-        validation: Validation volumes; see `nifti_data`. `phantoms` spends no subject on them. Default: `phantoms`, as
-            in runs that name none.
-        test: Test volumes; see `nifti_data`. `phantoms` spends no subject on them. Default: `phantoms`, as in runs that
-            name none.
+        validation: Validation volumes; see `nifti_data`. `phantoms` uses no subjects. Default: `phantoms`, as in runs
+            that name none.
+        test: Test volumes; see `nifti_data`. `phantoms` uses no subjects. Default: `phantoms`, as in runs that name
+            none.
         split_seed: Seed that draws the subjects of shares and folds. Default: 0.
         folds: Cross-validation; see `nifti_data`. Default: None.
         fold: Number of the test fold, from 0. Default: None.
 
     Raises:
-        InvalidValueError: If a number is out of range, or the volumes cannot be split so.
+        InvalidValueError: If a number is out of range, or the volumes cannot be split this way.
     """
     n_beside = check_int("data.n_training", n_training, at_least=0)
     given = {"test": test, "validation": validation}

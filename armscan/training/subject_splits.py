@@ -13,10 +13,10 @@ from armscan.utils.validation import check_float, check_int, check_seed
 from armscan.volumes import Dataset
 
 DEFAULT_SHARE = 0.25
-# Where phantoms take the place of subjects.
+# Choice of phantoms instead of subjects.
 PHANTOMS = "phantoms"
 LEAVE_ONE_OUT = "leave_one_out"
-# Of each part a share of the subjects, names, or None for what is usual.
+# For each part, a share of the subjects, names, or None for the default.
 Wanted = dict[str, float | str | Sequence[str] | None]
 
 
@@ -24,8 +24,8 @@ def n_folds(folds: object, n_subjects: int) -> int:
     """Return the number of folds.
 
     Args:
-        folds: Folds: `leave_one_out` makes each subject one; a number, from 2 to the number of subjects, gives their
-            number.
+        folds: `leave_one_out`, which makes each subject a fold; or the number of folds, from 2 to the number of
+            subjects.
         n_subjects: Number of subjects.
 
     Raises:
@@ -41,7 +41,7 @@ def n_folds(folds: object, n_subjects: int) -> int:
 
 
 def tested(subjects: Sequence[str], folds: object, fold: object, seed: int) -> tuple[list[str], list[str]]:
-    """Return the subjects that a fold tests on, and those of the fold after it.
+    """Return the subjects of a fold, which are tested on, and of the fold after it.
 
     Args:
         subjects: All subjects, each once.
@@ -72,14 +72,14 @@ def parts_by_subject(
 
     Args:
         dataset: Volumes and their subjects.
-        wanted: Choice of `validation` and `test`, by name; a missing part gets no volume.
+        wanted: Choice of `validation` and `test`, by their names; a missing part gets no volume.
         path: Folder of the volumes, for errors.
         split_seed: Seed that draws the subjects of shares and folds.
         folds: Folds; see `n_folds`. None: no cross-validation.
         fold: Number of the test fold; None without folds.
 
     Raises:
-        InvalidValueError: If the volumes cannot be split so.
+        InvalidValueError: If the volumes cannot be split this way.
     """
     if folds is None and fold is not None:
         raise InvalidValueError(f"data.fold is {fold!r}, but data.folds is None: it must say how many folds there are")
@@ -122,7 +122,7 @@ def _drawn(dataset: Dataset, wanted: Wanted, path: str, split_seed: int) -> dict
 
 
 def _named(dataset: Dataset, names: Sequence[str], part: str, path: str) -> list[str]:
-    """Return the volumes that are named, themselves or by their subject."""
+    """Return the volumes that are named, directly or by their subject."""
     known = [*dataset.volumes, *dataset.subjects.values()]
     if not all(isinstance(name, str) for name in names):
         raise InvalidValueError(f"data.{part} is {names!r}, but it must be a share, or names of subjects or volumes")

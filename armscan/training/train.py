@@ -1,4 +1,4 @@
-"""One training: epochs of learning, each followed by a validation, until the budget is spent or the task is solved."""
+"""One training: epochs of learning, each followed by a validation, until the budget is used up or the task solved."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from armscan.utils.validation import check_choice, check_float, check_int
 
 @dataclass(frozen=True, kw_only=True)
 class SolvedCriterion:
-    """Criterion that stops the training before its budget is spent.
+    """Criterion that stops the training before its budget is used up.
 
     Args:
         success_rate: Lowest success rate on the validation episodes, in [0, 1].
         mean_steps: Largest mean number of steps on the validation episodes, 1 or more.
-        n_epochs: Number of consecutive epochs that must meet both, 1 or more.
+        n_epochs: Number of consecutive epochs that must meet both criteria, 1 or more.
     """
 
     success_rate: float = 1.0
@@ -40,7 +40,7 @@ class SolvedCriterion:
         check_int("training.solved.n_epochs", self.n_epochs, at_least=1)
 
     def holds(self, reports: Sequence[EpochReport]) -> bool:
-        """Return whether the last epochs meet it."""
+        """Return whether the last epochs meet the criterion."""
         last = reports[-self.n_epochs :]
         return len(last) == self.n_epochs and all(
             report.evaluation.success_rate >= self.success_rate and report.evaluation.mean_steps <= self.mean_steps
@@ -57,11 +57,11 @@ class Budget:
             once.
         eval_every_env_steps: Environment steps between two validations, 1 or more; rounded up in the same way.
         validation_episodes: Number of episodes of each validation, 1 or more.
-        solved: Criterion that stops the training early; None spends the whole budget.
+        solved: Criterion that stops the training early; None uses the whole budget.
         best_by: Criterion that chooses the best epoch, `success` or `distance`; see `Evaluation.score`.
         schedule: Changes of the agent's hyperparameters, a mapping for each: `from_env_steps` and values by keys, such
-            as `agent.lr`. Each applies from the first epoch that begins after so many environment steps, and lasts
-            until another changes it. None changes nothing.
+            as `agent.lr`. Each applies from the first epoch that begins at or after `from_env_steps`; a value lasts
+            until another change of it. None changes nothing.
     """
 
     env_steps: int
@@ -137,7 +137,7 @@ def train(
     is_solved = budget.solved is not None and budget.solved.holds(reports)
     with ExitStack() as stack:
         for callback in callbacks:
-            # Also after an error in the start of a later one.
+            # Also called if a later callback fails to start.
             stack.callback(callback.on_end)
             callback.on_start(budget.env_steps, tuple(reports))
         if not reports:

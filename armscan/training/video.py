@@ -20,10 +20,10 @@ FRAME_MS = 600
 LAST_FRAME_MS = 2400
 MAX_COLOURS = 128
 MAX_ATTEMPTS = 20
-# Of an MP4, whose pictures all last equally long: a picture of an episode is several of them.
+# Duration of each picture of an MP4; a picture of an episode is repeated as often as needed.
 PICTURE_MS = 100
 QUALITY = 8
-# A browser shows it before it has all of it.
+# A browser can play the file before it is fully loaded.
 PLAYS_AT_ONCE = ("-movflags", "+faststart")
 TITLE_AT = (16, 3)
 
@@ -31,11 +31,11 @@ Picture = NDArray[np.uint8]
 
 
 class VideoRecorder:
-    """Pictures one after another, each written when it comes; at no time are all of them in memory.
+    """Writes pictures one by one, so that they are never all in memory.
 
     Args:
         gif: GIF file to write.
-        mp4: MP4 file with the same pictures; None for none.
+        mp4: MP4 file to write with the same pictures. Default: None, no MP4.
     """
 
     def __init__(self, gif: Path, mp4: Path | None = None) -> None:
@@ -45,7 +45,7 @@ class VideoRecorder:
         self._before: Image.Image | None = None
 
     def add(self, picture: Picture, duration_ms: int = FRAME_MS) -> None:
-        """Add a picture, shape (height, width, 3), both even; the same for all."""
+        """Add a picture, shape (height, width, 3), both even, and the same for all pictures."""
         self._add_to_gif(Image.fromarray(picture), duration_ms)
         if self._mp4_file is not None:
             if self._mp4 is None:
@@ -61,7 +61,7 @@ class VideoRecorder:
             env: Environment made with `render_mode="rgb_array"`.
             volume_name: Name of one of the environment's volumes.
             seed: Seed of the episode.
-            title: Text above each picture, and before the outcome above the last one; empty for neither.
+            title: Text above each picture; above the last one, the outcome follows it. Default: no text.
 
         Returns:
             The episode, as an evaluation would have played it.
@@ -80,7 +80,7 @@ class VideoRecorder:
     def _add_to_gif(self, picture: Image.Image, duration_ms: int) -> None:
         box = (0, 0, *picture.size)
         if self._before is not None:
-            # Only what has changed; a picture that is the same still lasts, and is a picture of its own.
+            # Only the changed part; an unchanged picture is still added, because it has its own duration.
             box = ImageChops.difference(self._before, picture).getbbox() or (0, 0, 1, 1)
         changed = picture.crop(box).quantize(MAX_COLOURS, dither=Image.Dither.NONE)
         if self._before is None:
@@ -143,7 +143,7 @@ def record_episode(agent: Agent, env: Env, path: Path, *, seed: int) -> None:
         _, info = env.reset(seed=seed + attempt, options={"volume": first})
         if not info["starts_solved"]:
             break
-    # Not what a link at this place leads to.
+    # If this is a link, its target must not be overwritten.
     path.unlink(missing_ok=True)
     with VideoRecorder(path) as video:
         video.capture(agent, env, volume_name=first, seed=seed + attempt)

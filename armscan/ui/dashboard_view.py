@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from wsgiref.types import StartResponse, WSGIApplication, WSGIEnvironment
 
 STUDIES = re.compile(r"/api/studies(/\d+)?")
-# Where notes of runs lead that no server keeps.
+# The address in notes that link to runs in a local store, which no MLflow server tracks.
 LOCAL_RUNS = re.compile(rf"http://127\.0\.0\.1:{MLFLOW_PORT}(?=/#/)")
-# Attributes by which trials of armscan are known.
+# Attributes that identify trials of armscan.
 OF_TRIAL = {names.LEASE, names.CONFIG_SHA256, names.FINALIST}
 HIDDEN_OF_STUDY = names.OF_STUDY | {names.STUDY_RUN, names.NOTE_SUM, names.RESET_FAILURES}
 # The note has the run, the folder and the metrics of the seeds.
@@ -32,19 +32,20 @@ NAMES = {
     names.FINAL_SEED: "seed",
     names.STOP: "stopped",
 }
-# Of a running trial, from what its worker reports.
+# Progress of a running trial, from its worker's lease.
 PROGRESS = {"worker": "worker", "seed": "seed", names.ENV_STEPS: "environment steps", "return": "return, mean"}
 TELL = re.compile(r"/api/trials/(\d+)/tell")
 
 
 class DashboardView:
-    """A WSGI application that changes the answers of Optuna's dashboard; other people's studies stay as they are.
+    """WSGI middleware that changes the responses of Optuna's dashboard; studies not made by armscan stay as they are.
 
     Args:
         application: WSGI application of Optuna's dashboard.
-        stop: Asks the worker of a trial to end it, by the trial's ID in the storage; returns whether there is one. The
-            button that fails a running trial does that: a worker keeps what it has, and the trial ends as pruned.
-        mlflow: Address of MLflow's UI that links of trials lead to. Default: None, links do not change.
+        stop: Function that asks the worker of a trial, by its ID in the storage, to end it; returns whether there is a
+            worker. The button that fails a running trial calls it: the worker keeps its results, and the trial ends as
+            pruned.
+        mlflow: Address of MLflow's UI for the links of trials. Default: None, the links stay as they are.
     """
 
     def __init__(self, application: WSGIApplication, stop: Callable[[int], bool], mlflow: str | None = None) -> None:
@@ -90,7 +91,7 @@ class DashboardView:
 
 
 def _attributes(trial: Mapping[str, Any]) -> list[dict[str, str]]:
-    """Return the attributes that are shown of a trial; of one that runs, how far it is."""
+    """Return the attributes that are shown of a trial; of a running one, its progress, too."""
     values = {each["key"]: each["value"] for each in trial["user_attrs"]}
     shown = {NAMES.get(key, key): value for key, value in values.items() if key not in HIDDEN}
     if trial["state"] == "Running":

@@ -10,18 +10,17 @@ from urllib.parse import urlsplit
 if TYPE_CHECKING:
     from wsgiref.types import StartResponse, WSGIApplication, WSGIEnvironment
 
-# Of requests that browsers send for another page without asking the server first.
+# `Sec-Fetch-Site` of requests from other sites, which browsers send without asking the server first.
 FROM_ELSEWHERE = ("cross-site", "same-site")
 SAFE_METHODS = ("GET", "HEAD")
-# Of files that anybody may have put into a study: scripts in them do not run, and no type is guessed.
+# Headers for files that anybody may have put into a study: no script in them runs, and no type is guessed.
 ARTIFACTS, SANDBOX = "/artifacts/", (("Content-Security-Policy", "sandbox"), ("X-Content-Type-Options", "nosniff"))
 
 
 class HostCheck:
-    """A WSGI application that refuses requests for other hosts, and those of other pages; artifacts are sandboxed.
+    """WSGI middleware that refuses requests for other hosts and from other sites, and sandboxes artifacts.
 
-    Without it, any web page could read and delete studies: by DNS rebinding, its own name leads to this machine.
-    MLflow's server has the same check.
+    Without it, any web page could read and delete studies, by DNS rebinding. MLflow's server has the same check.
 
     Args:
         application: WSGI application to protect.

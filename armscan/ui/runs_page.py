@@ -1,4 +1,4 @@
-"""The page of MLflow's UI that shows the runs; its first page is about something else."""
+"""Address of the page in MLflow's UI that shows the runs, which its home page does not."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ MAX_EXPERIMENTS = 200
 
 
 def runs_page(address: str) -> str:
-    """Return the page of the runs of the experiment that has the latest run, with the columns that matter.
+    """Return the address of the page with the runs of the latest run's experiment, with the columns that matter.
 
     Args:
         address: Address of an MLflow server that answers.
 
     Returns:
-        The page; that of all experiments if there is no run, or the server does not say.
+        The address; the page of all experiments if there is no run, or the server does not answer as expected.
     """
     try:
         experiments = _asked(address, "experiments", {"max_results": MAX_EXPERIMENTS}).get("experiments", [])

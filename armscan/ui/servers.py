@@ -1,4 +1,4 @@
-"""Servers for the browser of this machine: Optuna's dashboard in a thread, MLflow's UI in a process."""
+"""Local servers for a browser: Optuna's dashboard in a thread, MLflow's UI in a process."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class _Quiet(WSGIRequestHandler):
 
 
 def check_port(option: str, port: int) -> None:
-    """Raise `InvalidValueError` unless a server of this machine can use a port, which `option` sets."""
+    """Raise `InvalidValueError` unless a local server can listen on a port, which `option` sets."""
     try:
         socket.create_server((HOST, port)).close()
     except OSError as error:
@@ -62,7 +62,7 @@ def start_dashboard(
 ) -> str:
     """Serve Optuna's dashboard for the rest of this process; return its address.
 
-    Its own program would open a journal without the lock that workers use.
+    Optuna's own command would open a journal without the lock that workers use.
 
     Args:
         storage: Storage of the studies.
@@ -71,7 +71,7 @@ def start_dashboard(
         host: Address to listen on. Default: the loopback address.
         allowed_hosts: Names and ports, `NAME:PORT`, by which browsers may reach it; `*` stands for any port.
             Default: `127.0.0.1` and `localhost` with the port.
-        mlflow: Address of MLflow's UI that links of trials lead to. Default: None, the address that they name.
+        mlflow: Address of MLflow's UI for the links of trials. Default: None, the links stay as they are.
     """
     from optuna.artifacts import FileSystemArtifactStore
     from optuna_dashboard import wsgi
@@ -95,7 +95,8 @@ def mlflow_server(uri: str, port: int) -> Iterator[subprocess.Popen[bytes]]:
         TrackingError: If the server does not answer in time, or ends by itself; the end of its log is printed.
     """
     store = database_url(uri, TRACKING_PASSWORD).render_as_string(hide_password=False)
-    # In the environment, because anyone can read the command line of a process. Without jobs: eight processes fewer.
+    # In the environment, because anyone can read a process's command line. Without job execution MLflow starts eight
+    # processes fewer.
     environment = os.environ | {"MLFLOW_BACKEND_STORE_URI": store, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}
     environment.pop("MLFLOW_TRACKING_URI", None)
     command = [*child_command(__name__, serve_mlflow.__name__), "server", *MLFLOW_OPTIONS, "--port", str(port)]
@@ -122,7 +123,7 @@ def mlflow_server(uri: str, port: int) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def serve_mlflow(parent_pid: int) -> None:
-    """Run MLflow's program with the arguments of this process, which ends with its parent.
+    """Run MLflow's command with the arguments of this process, which ends with its parent.
 
     Args:
         parent_pid: Process ID of the parent.

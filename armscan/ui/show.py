@@ -40,7 +40,7 @@ def show(
         dashboard_port: Port of Optuna's dashboard.
         named: Options given on the command line, `--storage` or `--tracking`; these stores must exist.
     """
-    # Deferred: a mistake on the command line should be answered before this is loaded.
+    # Deferred: a mistake on the command line should be reported before this is loaded.
     from armscan.sweeps.storage.storage import existing_storage
 
     studies, is_server = existing_storage(storage, where="--storage"), tracking.startswith("http")
@@ -73,7 +73,7 @@ def show(
             print(f"result    {dashboard}/dashboard/studies/{number}/note (study {printable(name)})", flush=True)
     if has_runs:
         with mlflow_server(tracking, mlflow_port) as process:
-            # Deferred: it loads what knows of runs.
+            # Deferred: it imports the tracking package.
             from armscan.ui.runs_page import runs_page
 
             print(f"runs      {runs_page(f'http://{HOST}:{mlflow_port}')}")
@@ -95,7 +95,7 @@ def last_judged(storage: Storage) -> tuple[str, int] | None:
 
 
 def _has_runs(uri: str) -> bool:
-    """Return whether a database has the tables of MLflow, which would create them."""
+    """Return whether a database has the tables of MLflow, which would create them itself."""
     from sqlalchemy.exc import SQLAlchemyError
 
     from armscan.sweeps.storage.database import tables_in

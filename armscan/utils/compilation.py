@@ -1,4 +1,4 @@
-"""Functions that Numba compiles: their cache, and a line in the log when they are compiled, which takes a while."""
+"""Functions that Numba compiles: their cache, and a log line when compilation, which takes a while, begins."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ CONFIG: Any = numba.config
 
 
 def cached_njit(**options: Any) -> Callable[[Function], Function]:
-    """Return `numba.njit`, with a cache that is new when any compiled function of armscan has changed.
+    """Return `numba.njit` with a cache that is invalidated if any compiled function of armscan has changed.
 
-    Numba itself compares only the file of a function, not those of the compiled functions that it calls, and would go
-    on with their old code.
+    Numba itself checks only the file of a function, not those of the compiled functions that it calls, and would keep
+    their old code.
 
     Args:
         options: Options of `numba.njit` beside `cache`.
     """
 
     def compiled(function: Function) -> Function:
-        # The user's own setting, such as NUMBA_CACHE_DIR, is put back for the functions of others.
+        # The user's own setting, such as NUMBA_CACHE_DIR, is restored for other packages' functions.
         before = CONFIG.CACHE_DIR
         CONFIG.CACHE_DIR = str(Path(before or PACKAGE / "__pycache__") / f"armscan-{_sources_sha256()}")
         try:
@@ -49,7 +49,7 @@ def cached_njit(**options: Any) -> Callable[[Function], Function]:
 def _lock_cache(dispatcher: Any) -> None:
     """Let one process at a time write the cache of a function.
 
-    Two that compile it for different types would otherwise give both results the same file.
+    Two processes that compile it for different types would otherwise write both results to the same file.
     """
     # Without compilation (NUMBA_DISABLE_JIT) there is no cache.
     if (kept := getattr(dispatcher, "_cache", None)) is None:
@@ -66,18 +66,18 @@ def _lock_cache(dispatcher: Any) -> None:
 
 @cache
 def _sources_sha256() -> str:
-    """Return the SHA-256 of all files with compiled functions, its first 16 digits."""
+    """Return the first 16 digits of the SHA-256 of all files with compiled functions."""
     sources = (file.read_bytes() for file in sorted(PACKAGE.rglob("*.py")))
     return sha256(b"".join(source for source in sources if b"njit" in source)).hexdigest()[:16]
 
 
 @contextmanager
 def compilation_told(text: str, is_meant: Callable[[Any], bool]) -> Iterator[None]:
-    """Log a text inside the context when a function begins to be compiled, once; numba's cache then has it.
+    """Log a text once inside the context, when Numba begins to compile a function that its cache does not have.
 
     Args:
         text: Text to log.
-        is_meant: Function that says whether a numba dispatcher is among the functions that the text is about.
+        is_meant: Function that returns whether a Numba dispatcher is among the functions that the text is about.
     """
     with install_listener("numba:compile", _Note(text, is_meant)):
         yield

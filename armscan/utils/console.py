@@ -1,4 +1,4 @@
-"""Tables in a terminal or a log: no name is broken in its middle."""
+"""Tables in a terminal or a log, which never break a name."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rich.measure import Measurement
 from rich.table import Column, Table
 from rich.text import Text
 
-# Of what is no terminal: results choose their columns by it, other tables take what they need.
+# Widths of output that is not a terminal: results choose columns to fit the first, other tables take what they need.
 LOG_CHARS, WHOLE_CHARS = 160, 10_000
 
 
@@ -25,7 +25,7 @@ def wide_console(log_chars: int = LOG_CHARS) -> Console:
 
 
 def print_sentence(text: str) -> None:
-    """Print a text whose lines break between words on a terminal, and nowhere in a file or pipe."""
+    """Print a text, wrapped between words on a terminal, and unwrapped in a file or pipe."""
     wide_console(WHOLE_CHARS).print(Text(text), highlight=False)
 
 

@@ -8,7 +8,7 @@ from typing import Any, TextIO
 
 from armscan.errors import printable
 
-# What a cell begins with that a spreadsheet takes for a formula, also in full width.
+# First characters of what a spreadsheet takes for a formula, full-width ones included.
 FORMULA = ("=", "+", "-", "@", "\uff1d", "\uff0b", "\uff0d", "\uff20")
 
 
@@ -26,9 +26,9 @@ def write_csv(file: TextIO, columns: Sequence[str], rows: Iterable[Mapping[str, 
 
 
 def safe_cell(value: Any) -> Any:
-    """Return a value as it stands in a cell: a string that a spreadsheet would compute follows an apostrophe.
+    """Return a value for a cell: a string that a spreadsheet would evaluate gets an apostrophe in front.
 
-    Control characters, which may begin another line, are spelled out. Numbers stay as they are, also as strings.
+    Control characters, which may begin another line, are escaped. Numbers stay as they are, even as strings.
     """
     if not isinstance(value, str):
         return value

@@ -1,4 +1,4 @@
-"""The files of a run's folder, files that are there whole or not at all, and folders that one process holds."""
+"""The files of a run's folder, atomic writes, and folders locked by one process."""
 
 from __future__ import annotations
 
@@ -18,42 +18,42 @@ from filelock import FileLock, Timeout
 
 from armscan.errors import FolderInUseError, FolderTakenError
 
-# What training keeps in the folder of its run, what the run was started with, and who is at work in it.
+# The checkpoints of a training, and what its run was started with.
 BEST_CHECKPOINT, LAST_CHECKPOINT = "best.pt", "last.pt"
 CONFIG_FILE, VOLUMES_FILE = "config.yaml", "volumes.json"
-# The code as it differed from its commit, and the versions of all that it was run with.
+# The diff of the code from its commit, and the versions of what it was run with.
 DIFF_FILE, ENVIRONMENT_FILE = "code.diff", "environment.json"
-# The code of a run that went on with another, by how often it had been resumed.
+# The diff of a run that was resumed with other code, by the number of times that it had been resumed.
 RESUMED_DIFF_FILE = "resumed_{0}_" + DIFF_FILE
-# What came of it; of a trial's training, the run that it is.
+# The final evaluation; in the folder of a trial's training, its run.
 EVALUATION_FILE, RUN_FILE = "evaluation.json", "run.json"
-# The baselines' episodes, and the page with the table of both.
+# The baselines' episodes, and the page with the results of both.
 BASELINES_FILE, RESULTS_PAGE = "baselines.json", "results.html"
 LEARNING_CURVE_FILE, VIDEO_FILE = "learning_curve.png", "episode.gif"
-# Whether the same came of it as of the run that it repeats.
+# Whether a run gave the same results as the one that it repeats.
 REPRODUCTION_FILE = "reproduction.json"
-# Of a run's ID, where there is no room for all of it.
+# Length of a shortened run ID.
 ID_CHARS = 8
 RECORDS = (RUN_FILE, REPRODUCTION_FILE)
 POLICY_FOLDER = "policy"
-# All that a run makes in its folder, beside what Hydra and the outbox leave there: before it is tracked, and after.
+# All that a run writes into its folder, apart from Hydra and the outbox: before it is tracked, and after.
 STARTED_WITH = (CONFIG_FILE, VOLUMES_FILE, ENVIRONMENT_FILE, DIFF_FILE)
 RESULTS = (
     *(BEST_CHECKPOINT, LAST_CHECKPOINT, EVALUATION_FILE, BASELINES_FILE, RESULTS_PAGE),
     *(LEARNING_CURVE_FILE, VIDEO_FILE),
 )
-# The tags of a run that hold the sums of what it was started with.
+# Tags of a run with the SHA-256 of what it was started with.
 SHA256_TAGS = {CONFIG_FILE: "config.sha256", VOLUMES_FILE: "volumes.sha256"}
 LOCK_FILE = ".lock"
-# The folder of what is to be tracked, in that of a run.
+# The outbox, a folder in a run's folder for what is still to be tracked.
 OUTBOX_FOLDER = "tracking"
-# Of a run's outbox: how far it is delivered, who holds it, and itself, each named after the run.
+# Of the files of a run's outbox, named after the run: the delivered position, the lock, and the entries.
 OUTBOX_SUFFIXES = (".delivered.json", ".lock", ".jsonl")
 RUN_ID = "[0-9a-f]" * 32
 UNFINISHED = "unfinished"
-# No space is left, or none that this user may take.
+# The disk is full, or the user's quota is.
 FULL_DISK = (errno.ENOSPC, errno.EDQUOT)
-# How the address of a database in a file begins.
+# Prefix of the address of a database in a file.
 SQLITE_PREFIX = "sqlite:///"
 
 
@@ -64,20 +64,20 @@ def cache_folder() -> Path:
 
 
 def sqlite_file(uri: str) -> Path:
-    """Return the file of a database, as it is understood from everywhere."""
+    """Return the absolute path of a database's file."""
     return Path(uri.removeprefix(SQLITE_PREFIX)).absolute()
 
 
 def atomic_write(path: Path, write: Callable[[BinaryIO], object], *, follow_link: bool = False) -> None:
-    """Write a file beside its place and move it there: a reader sees the old one or the new one, never half of one.
+    """Write a file under a temporary name and rename it: a reader sees the old or the new one, never half of one.
 
-    Once it has returned, neither a killed process nor a power cut loses the new one.
+    Once this has returned, neither a killed process nor a power cut loses the new one.
 
     Args:
-        path: Place of the file, in an existing folder.
+        path: Path of the file, in an existing folder.
         write: Function that writes the contents to the open file.
-        follow_link: Whether to replace the file that a link at this place leads to, and not the link. Default: False,
-            because a stranger's folder may have links to any file of this user.
+        follow_link: Whether to replace the target of a link at this path, and not the link. Default: False, because an
+            untrusted folder may have links to any file of this user.
     """
     path = _place(path, follow_link=follow_link)
     unfinished = _unfinished(path)
@@ -101,13 +101,13 @@ def _place(path: Path, *, follow_link: bool) -> Path:
 
 @contextlib.contextmanager
 def named_if_full(path: Path) -> Iterator[None]:
-    """Name the file in the error of a full disk, which itself names it only when a file is opened.
+    """Name the file in the error of a full disk, which has a name of its own only if opening a file raised it.
 
     Args:
         path: File, or folder of several files.
 
     Raises:
-        OSError: With the path, in the place of any error that a full disk has led to.
+        OSError: With the path, replacing any error that a full disk caused.
     """
     try:
         yield
@@ -119,7 +119,7 @@ def named_if_full(path: Path) -> Iterator[None]:
 
 
 def _full_disk(error: BaseException | None) -> OSError | None:
-    """Return the error of a full disk that an error is, or that it came of; None if there is none."""
+    """Return the error of a full disk: the error itself, or one that caused it; None if there is none."""
     while error is not None and not (isinstance(error, OSError) and error.errno in FULL_DISK):
         error = error.__cause__ or error.__context__
     return error
@@ -132,7 +132,7 @@ def nearest_existing(path: Path) -> Path:
 
 
 def check_writable(path: Path) -> None:
-    """Raise the `OSError` that `atomic_write` would meet at a place, where it follows links; leave nothing there."""
+    """Raise the `OSError` that `atomic_write`, following links, would raise at a path; leave no file behind."""
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
     unfinished = _unfinished(path.resolve())
@@ -150,7 +150,7 @@ def sha256(contents: bytes) -> str:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Bring a folder's own entries to the disk, without which a file's new name may be lost."""
+    """Flush a folder's entries to disk, without which a file's new name may be lost."""
     # Not every system can open a folder, and not every file system can sync one; the file itself is whole either way.
     with contextlib.suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
@@ -161,7 +161,7 @@ def _sync_folder(folder: Path) -> None:
 
 
 def is_made_by_run(name: str) -> bool:
-    """Return whether a file of this name, relative to the folder of a run, is one that runs make there."""
+    """Return whether a file of this name, relative to the folder of a run, is one that runs write."""
     return (
         name in (*STARTED_WITH, *RESULTS, *RECORDS)
         or fnmatch.fnmatchcase(name, RESUMED_DIFF_FILE.format("*"))
@@ -171,11 +171,11 @@ def is_made_by_run(name: str) -> bool:
 
 def check_free(folder: Path) -> None:
     """Raise `FolderTakenError` if a folder has a file named like a run's, but not made by a run."""
-    # An earlier run that was never tracked has left what it was started with: the first three, always together.
+    # An earlier run that was never tracked has left its start files, the first three of which come together.
     outboxes = (folder / OUTBOX_FOLDER).glob(RUN_ID + OUTBOX_SUFFIXES[-1])
     if any(outboxes) or all((folder / name).is_file() for name in STARTED_WITH[:3]):
         return
-    # Also a link that leads nowhere.
+    # Broken links count, too.
     if taken := [name for name in (*RESULTS, *STARTED_WITH, POLICY_FOLDER) if os.path.lexists(folder / name)]:
         raise FolderTakenError(
             f"{folder}: holds {taken[0]}, which no run made and this run would overwrite: "
@@ -191,7 +191,7 @@ def remove_unfinished(folder: Path) -> None:
 
 @contextlib.contextmanager
 def folder_lock(folder: Path) -> Iterator[None]:
-    """Hold the folder of a run until this process ends or leaves; raise `FolderInUseError` if another one holds it."""
+    """Lock the folder of a run inside the context; raise `FolderInUseError` if another process holds the lock."""
     try:
         with FileLock(folder / LOCK_FILE, timeout=0):
             yield
@@ -202,7 +202,7 @@ def folder_lock(folder: Path) -> Iterator[None]:
 
 
 def truncate_torn_line(path: Path) -> None:
-    """Remove the beginning of a line whose writer died before its end."""
+    """Remove an incomplete last line, whose writer died before its end."""
     with path.open("rb+") as file:
         size = file.seek(0, os.SEEK_END)
         # An empty file cannot be mapped.

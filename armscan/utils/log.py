@@ -1,4 +1,4 @@
-"""Log lines of a process, and its libraries without their noise."""
+"""Log lines of a process, and libraries silenced."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ def silence_libraries() -> None:
         ".*is an experimental feature.*",
         ".*Deprecat.*",
         ".*is not divisible by the number of test environments.*",
-        # Our values of a launcher are checked against the launcher's own, as they should be.
+        # Our launcher settings are validated against the launcher's schema, as intended.
         r"\s*'hydra/launcher/.*' is validated against ConfigStore schema",
     ):
         warnings.filterwarnings("ignore", message=message)
     for category in (DeprecationWarning, FutureWarning, PendingDeprecationWarning):
         warnings.filterwarnings("ignore", category=category)
-    # What Hydra tells of a class that is not there is in the error, too.
+    # What Hydra logs about a missing class is in the error, too.
     logging.getLogger("hydra.utils").setLevel(logging.CRITICAL)
     logging.getLogger("tianshou").setLevel(logging.ERROR)
     logging.getLogger("sensai").setLevel(logging.ERROR)

@@ -1,4 +1,4 @@
-"""The processor's instruction that asks for memory ahead of its use, for compiled code."""
+"""The processor's prefetch instruction for compiled code."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-# Of LLVM's prefetch: for reading, kept in all caches, data.
+# Arguments of LLVM's prefetch: for reading, kept in all caches, data.
 READ, KEEP, DATA = 0, 3, 1
 LLVM_NAME = "llvm.prefetch.p0"
 
 
 def _prefetch(context: Any, array: Any, index: Any) -> Any:
-    """Ask for the element of a flat array that is needed soon; unlike a read, nothing waits for it.
+    """Prefetch an element of a flat array that is needed soon; unlike a read, nothing waits for it.
 
     Args:
         context: Typing context, passed by Numba.

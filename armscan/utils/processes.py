@@ -1,4 +1,4 @@
-"""Processes: compute threads, whether a process is still the same, and the end of the parent of this one."""
+"""Processes: compute threads, garbage collection, whether a process is still alive, and the exit of the parent."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"
 
 
 def limit_threads() -> None:
-    """Set one compute thread for this process, unless the user set another number, before a library starts its pool.
+    """Limit this process to one compute thread, unless the user set a number; call it before libraries start pools.
 
-    Small networks are fastest so, and jobs side by side never claim more threads than there are cores.
+    Small networks are fastest with one thread, and parallel jobs never claim more threads than there are cores.
     """
     for variable in THREAD_VARIABLES:
         os.environ.setdefault(variable, "1")
@@ -41,10 +41,10 @@ def n_usable_cores() -> int:
 
 
 def collect_garbage_rarely() -> None:
-    """Collect cyclic garbage after 50,000 new objects, not after 700, and not at the end of the process.
+    """Collect cyclic garbage after 50,000 new objects, not after 700, and not at the exit of the process.
 
-    Libraries make some hundred thousand objects that stay. To look through them again and again takes half a second of
-    a command's three, and at the end of a run three seconds.
+    Libraries make some hundred thousand permanent objects. Scanning them again and again takes half a second of a
+    command's three, and three seconds at the end of a run.
     """
     gc.set_threshold(50_000)
     atexit.register(gc.freeze)
@@ -52,7 +52,7 @@ def collect_garbage_rarely() -> None:
 
 @contextmanager
 def no_garbage_collection() -> Iterator[None]:
-    """Collect no garbage while libraries load and objects that stay are made, and never look through these again."""
+    """Collect no garbage inside the context, while permanent objects are made, and never scan these again."""
     gc.disable()
     try:
         yield
@@ -62,11 +62,11 @@ def no_garbage_collection() -> Iterator[None]:
 
 
 def child_command(module: str, function: str) -> list[str]:
-    """Return the command of a child process, which may be interrupted while it still imports.
+    """Return the command of a child process, which exits cleanly if it is interrupted during its imports.
 
     Args:
-        module: Name of the module of the function.
-        function: Name of the function to call, with the ID of this process.
+        module: Name of the function's module.
+        function: Name of the function to call with the ID of this process.
     """
     first = collect_garbage_rarely.__name__
     steps = (
@@ -80,17 +80,17 @@ def child_command(module: str, function: str) -> list[str]:
 
 
 def process_start(pid: int) -> str:
-    """Return when a process was started, which tells it from a later one with its ID, however the clock is set.
+    """Return the start time of a process, which tells it from a later one with the same ID, however the clock is set.
 
     Returns:
-        An empty text if there is no such process, or if it has ended and has not been waited for.
+        The time in seconds; an empty string if there is no such process, or only a zombie.
     """
     try:
         process = psutil.Process(pid)
-        # On Linux, the seconds since boot; psutil adds the time of the boot, which moves with the clock.
+        # On Linux, the seconds since boot: psutil adds the boot time, which moves with the clock.
         since_s = psutil.boot_time() if psutil.LINUX else 0.0
         return "" if process.status() == psutil.STATUS_ZOMBIE else f"{process.create_time() - since_s:.2f}"
-    # Also for what is no process ID.
+    # Also if `pid` is not a process ID.
     except (psutil.Error, TypeError, ValueError):
         return ""
 
@@ -100,7 +100,7 @@ def _boot_and_pid_namespace() -> tuple[str, str]:
     if not psutil.LINUX:
         return "any", "any"
     try:
-        # Processes are looked up in /proc, which may be that of another namespace.
+        # /proc, in which processes are looked up, may belong to another namespace.
         is_own = str(Path("/proc/self").readlink()) == str(os.getpid())
         return BOOT_ID.read_text().strip(), str(Path("/proc/self/ns/pid").readlink()) if is_own else ""
     except OSError:
@@ -116,7 +116,7 @@ class ProcessInfo:
     Args:
         host: Name of the machine that it runs on.
         pid: Process ID on that machine.
-        started: Time of its start, see `process_start`; empty if no process is meant.
+        started: Start time, see `process_start`; empty for no process.
         directory: Working directory; empty if it is not needed.
         boot: ID of the machine's boot; empty if it is not known, as in records of earlier versions.
         pid_namespace: PID namespace of its process ID; empty if it is not known.
@@ -142,7 +142,7 @@ class ProcessInfo:
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> Self:
-        """Return the process that a mapping describes, also one of an earlier version; other keys are ignored."""
+        """Return the process that a mapping, possibly of an earlier version, describes; other keys are ignored."""
         nobody: dict[str, Any] = {"host": "", "pid": 0, "started": ""}
         return cls(**nobody | {each.name: values[each.name] for each in fields(cls) if each.name in values})
 
@@ -152,13 +152,13 @@ class ProcessInfo:
 
     @property
     def is_here(self) -> bool:
-        """Return whether it is a process that this one sees, of which it is known whether it is alive."""
+        """Return whether this process can see it, and so knows whether it is alive."""
         own = (socket.gethostname(), *_boot_and_pid_namespace())
         return all(own) and own == (self.host, self.boot, self.pid_namespace)
 
     @property
     def is_alive(self) -> bool:
-        """Return whether it has not ended; a process that is not seen from here is taken to be alive."""
+        """Return whether it has not ended; a process that cannot be seen from here counts as alive."""
         return not self.is_here or process_start(self.pid) == self.started != ""
 
     @property
@@ -168,10 +168,10 @@ class ProcessInfo:
 
 
 def on_parent_exit(parent_pid: int, action: Callable[[], object]) -> None:
-    """Call `action` in a thread once the process that started this one has ended.
+    """Call `action` in a thread once the parent process has ended.
 
     Args:
-        parent_pid: ID of that process, as `child_command` passes it: it may have ended while this one still imported.
+        parent_pid: ID of the parent, as `child_command` passes it: it may have ended during this process's imports.
         action: Function to call.
     """
 

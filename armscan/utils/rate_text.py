@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-# Form of a rate where space is short.
+# Short form of a rate.
 PERCENT = "{:.0%}"
 
 
 def formatted(form: str, value: float) -> str:
-    """Return a value in a form such as `{:.1%}`; a rate is never rounded to 0 or 100 %, but `<0.1%` or `>99.9%`."""
+    """Format a value, for instance by `{:.1%}`; instead of rounding to 0 or 100 %, a rate is `<0.1%` or `>99.9%`."""
     text = form.format(value)
     if form.endswith("%}") and 0.0 < value < 1.0:
         smallest = 10.0 ** -(len(text.partition(".")[2].rstrip("%")) + 2)

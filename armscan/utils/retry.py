@@ -13,7 +13,7 @@ from armscan.utils.log import log
 
 T = TypeVar("T")
 RETRY_S = 600.0
-# Between two attempts: at first, and at most; each pause is twice the one before.
+# The first pause between attempts, doubled after each one, and the longest.
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 5.0
 
 _this_thread = threading.local()
@@ -78,7 +78,7 @@ class RetryPolicy:
                 if told is None:
                     raise
                 reason, cause = told, error
-        # After one timeout nothing is retried: cleaning up would take as long again.
+        # After one timeout nothing is retried any more: cleanup would take as long again.
         self._is_over = True
         long = f"{self._retry_s:g} s" if self._retry_s < 60 else f"{self._retry_s / 60:g} minutes"
         raise self._error(f"{self._named}, but it has been unavailable for {long}: {reason}") from cause
@@ -105,7 +105,7 @@ class RetryPolicy:
 
 @contextmanager
 def no_retry() -> Iterator[None]:
-    """Return a context in which this thread does not retry: `RetryPolicy.call` raises its error at once."""
+    """Disable retries in this thread inside the context: `RetryPolicy.call` raises its error at once."""
     before = getattr(_this_thread, "no_retry", False)
     _this_thread.no_retry = True
     try:

@@ -13,7 +13,7 @@ MAX_SHOWN_CHARS = 500
 
 
 class Section(BaseModel):
-    """Accepts no other keys, and no value of another type; a field's description states its allowed values."""
+    """Model that accepts no unknown keys and converts no values; a field's description states its allowed values."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, arbitrary_types_allowed=True)
 

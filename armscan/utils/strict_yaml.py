@@ -1,4 +1,4 @@
-"""YAML of strangers, read within limits: they are checked on the events of libyaml, before anything is built."""
+"""Untrusted YAML, read within limits, which are checked on the events of libyaml before anything is built."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import yaml
 
-# Collections within each other; a manifest has five at the most, a configuration ten.
+# Nested collections; a manifest has at most five, a configuration ten.
 DEEPEST = 50
 # A manifest of 10,000 volumes has 140,000.
 MAX_NODES = 1_000_000
@@ -17,10 +17,11 @@ def load_yaml(text: str | bytes) -> Any:
     """Return the contents of a YAML file.
 
     Raises:
-        ValueError: If it is nested or repeats itself more than any file of armscan, or a mapping has a key twice.
-        yaml.YAMLError: If it is no YAML, or holds anything but plain values.
+        ValueError: If it is nested more than 50 deep, has more than a million nodes with its aliases expanded, or a
+            mapping has a key twice.
+        yaml.YAMLError: If it is not YAML, or holds anything but plain values.
     """
-    # Of each collection that is open, the nodes in it, and how many nodes these are with all that aliases repeat.
+    # The nodes in each open collection, and their number with all aliases expanded.
     open_nodes: list[list[yaml.NodeEvent]] = [[]]
     sizes, sizes_by_anchor = [0], dict[str | None, int]()
     for event in yaml.parse(text, yaml.CSafeLoader):
@@ -30,13 +31,13 @@ def load_yaml(text: str | bytes) -> Any:
             sizes_by_anchor[open_nodes[-1][-1].anchor] = size
             if isinstance(event, yaml.MappingEndEvent):
                 keys = [key.value for key in nodes[::2] if isinstance(key, yaml.ScalarEvent)]
-                # The key of what is merged may be there for each of it.
+                # The merge key may occur several times.
                 check_no_duplicates([key for key in keys if key != "<<"])
         elif isinstance(event, yaml.NodeEvent):
             open_nodes[-1].append(event)
             sizes[-1] += sizes_by_anchor.get(event.anchor, 1) if isinstance(event, yaml.AliasEvent) else 1
             if isinstance(event, yaml.CollectionStartEvent):
-                # Until it ends: a collection that contains itself has no end.
+                # Until it ends: a collection that contains itself is infinite.
                 sizes_by_anchor[event.anchor] = MAX_NODES + 1
                 open_nodes.append([])
                 sizes.append(0)

@@ -13,7 +13,7 @@ import numpy as np
 from armscan.errors import InvalidValueError, listed
 
 T = TypeVar("T")
-# Seeds of every random generator in use fit.
+# Within the range of seeds of every random generator in use.
 MAX_SEED = 2**31 - 1
 
 
@@ -68,7 +68,7 @@ def check_choice(name: str, value: T, allowed: Sequence[T]) -> T:
 def check_numbers(name: str, value: Any, length: int, meaning: str) -> tuple[float, ...]:
     """Return `value` as a tuple of `length` finite floats; `meaning` describes them, such as '(rz, rx) in degrees'."""
     if type(value) is tuple and [type(number) for number in value] == [float] * length and math.isfinite(sum(value)):
-        # What every step of an environment gives; the checks below cost more than the rest of its plane.
+        # The fast path of every environment step: the checks below cost more than the rest of its plane.
         return value
     is_sequence = isinstance(value, list | tuple) or (isinstance(value, np.ndarray) and value.ndim > 0)
     if not is_sequence or len(value) != length or not all(map(_is_finite, value)):
@@ -77,7 +77,7 @@ def check_numbers(name: str, value: Any, length: int, meaning: str) -> tuple[flo
 
 
 def check_ints(name: str, value: Any, length: int | None, meaning: str, **bounds: int) -> tuple[int, ...]:
-    """Return `value` as a tuple of `length` whole numbers, of any number of them if it is None.
+    """Return `value` as a tuple of `length` whole numbers, or of any number of them if `length` is None.
 
     Args:
         name: Name of the argument, for errors.

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from armscan.volumes.manifest_schema import Manifest, Splits
 
 SPLITS = ("train", "validation", "test")
-# What an entry and the whole manifest can say.
+# Keys allowed both in an entry and at the top of a manifest.
 SHARED_KEYS = ("labels", "orientation", "axes", "overlap")
 
 
@@ -64,7 +64,7 @@ def open_dataset(path: str | Path, *, require_manifest: bool = True) -> Dataset:
             empty.
 
     Returns:
-        The volumes in the order of their names, and what is known of them.
+        The volumes in the order of their names, and their metadata.
 
     Raises:
         VolumeError: If the folder or a file cannot be used.
@@ -97,11 +97,11 @@ def open_dataset(path: str | Path, *, require_manifest: bool = True) -> Dataset:
 
 
 def subjects_in(path: str | Path, n_volumes: int | None = None) -> list[str]:
-    """Return whose arm each volume of a folder is, as its manifest says, without reading a volume.
+    """Return the subject of each volume of a folder from its manifest, without reading a volume.
 
     Args:
         path: Folder of the volumes.
-        n_volumes: Number of volumes to count, the first by name. Default: None, all.
+        n_volumes: Number of volumes to include, the first by name. Default: None, all.
 
     Raises:
         VolumeError: If the folder cannot be read.
@@ -129,7 +129,7 @@ def _split_of(splits: Splits, subjects: Mapping[str, str], used: Mapping[str, ob
 
 
 def _manifest_of(path: str | Path, *, require_manifest: bool) -> tuple[Path | None, Manifest, dict[str, Path]]:
-    """Return the path and contents of a folder's manifest (None and an empty one if there is none), and its volumes."""
+    """Return the path and contents of a folder's manifest (None and an empty one if missing), and its volume files."""
     from armscan.volumes.manifest_schema import Manifest
 
     folder = check_path("the folder of volumes", path)

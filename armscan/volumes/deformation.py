@@ -1,4 +1,4 @@
-"""Deformations of a volume that keep a plane where it is: other wrists, looked up and never resampled."""
+"""Deformations of a volume that keep one plane fixed: other wrists, by lookup instead of resampling."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from armscan.volumes.rigid_transform import RigidTransform
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DeformingTransform(RigidTransform):
-    """A rigid motion T of a volume that is deformed about a plane first; the moved volume is V'(q) = V(D(T(q))).
+    """A rigid motion T of a volume deformed about a plane; the moved volume is V'(q) = V(D(T(q))).
 
-    D keeps the plane as a set of points. In the plane's frame (across, along its normal, in depth), from the point
-    `about_mm` on, the volume's point x comes to lie at F x, F being `deformation`, so that a lookup at x takes F^-1 x.
-    `inverse_plane` holds for this plane: that another one is bent away by the shears along the arm is left out.
+    D maps the plane onto itself. In the plane's frame (across, along its normal, in depth), with `about_mm` as the
+    origin, F = `deformation` moves the volume's point x to F x, so that a lookup at x reads F^-1 x. `inverse_plane`
+    holds for this plane; for any other it ignores the deformation.
 
     Args:
         plane: Plane that the deformation keeps.
         about_mm: Fixed point of the plane, (across, depth) in its frame, in mm.
-        deformation: Matrix F, shape (3, 3); its second row is zero but for the stretch along the normal.
+        deformation: Matrix F, shape (3, 3); its second row is zero except for the stretch along the normal.
 
     Raises:
-        InvalidValueError: If `deformation` moves the plane, or squeezes the volume flat.
+        InvalidValueError: If `deformation` moves the plane or is singular.
     """
 
     plane: ManipulatorAction
@@ -46,7 +46,7 @@ class DeformingTransform(RigidTransform):
 
     @cached_property
     def maps(self) -> FloatArray:
-        """The two affine maps (A | b): that of D, and that of T, which comes first. See `RigidTransform.maps`."""
+        """The affine maps (A | b) of D and T, in this order; T is applied first. See `RigidTransform.maps`."""
         frame = self.plane.matrix
         matrix: FloatArray = frame @ np.linalg.inv(self.deformation) @ frame.T
         across_mm, depth_mm = self.about_mm

@@ -1,7 +1,7 @@
-"""Text headers of NRRD files and MetaImages, checked where the reading library would mend them in silence.
+"""Check NRRD files and MetaImages for errors that SimpleITK silently repairs or ignores.
 
-SimpleITK replaces a NaN, zero, negative or missing spacing by another one, and reads compressed voxels that are
-damaged. Both would end in wrong figures, so they are looked for here before the file is read.
+SimpleITK replaces a NaN, zero, negative or missing spacing by another one, and reads damaged compressed voxels. Both
+would lead to wrong results, so files are checked here before they are read.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ METAIMAGE_TYPES = {
     "MET_DOUBLE": 8,
 }
 METAIMAGE_FIELDS = ("NDims", "DimSize", "ElementType", "ElementDataFile")
-# Without what is said of signs.
+# Without `signed`, `unsigned` and the suffix `_t`.
 NRRD_TYPES = {"char": 1, "uchar": 1, "int8": 1, "uint8": 1, "short": 2, "short int": 2, "ushort": 2, "int16": 2}
 NRRD_TYPES |= {"uint16": 2, "int": 4, "uint": 4, "int32": 4, "uint32": 4, "longlong": 8, "long long": 8}
 NRRD_TYPES |= {"long long int": 8, "ulonglong": 8, "int64": 8, "uint64": 8, "float": 4, "double": 8}
@@ -38,7 +38,7 @@ NRRD_ENCODINGS = {"raw": None, "gzip": GZIP, "gz": GZIP}
 
 
 def check_nrrd(path: Path, needed: Sequence[str] = ()) -> None:
-    """Raise `VolumeError` if a NRRD file is damaged, lacks a field, or gives no finite and positive spacing."""
+    """Raise `VolumeError` if an NRRD file is damaged, lacks a field, or gives no finite and positive spacing."""
     header, end, _ = _text_header(path).partition(b"\n\n")
     if b"\r\n" in header or not end:
         header, end, _ = _text_header(path).partition(b"\r\n\r\n")
@@ -97,7 +97,7 @@ def check_metaimage(path: Path) -> None:
     if fields.get("HeaderSize", "0") != "0":
         raise VolumeError(f"{path}: HeaderSize is {fields['HeaderSize']}, but it must be 0 or not there")
     n_compressed = str(file.stat().st_size - offset)
-    # Without it, SimpleITK cannot read voxels behind their own header.
+    # Without it, SimpleITK cannot read compressed voxels that follow their header.
     n_promised = fields.get("CompressedDataSize", "no number" if is_local else n_compressed)
     if is_compressed and n_promised != n_compressed:
         raise VolumeError(
@@ -114,9 +114,9 @@ def check_metaimage(path: Path) -> None:
     check_stored(path, stored)
 
 
-# By ending; the first that fits a name is the file's.
+# By suffix; the first one that a file name ends with applies.
 CHECKS: dict[str, Callable[[Path], None]] = {
-    # A segmentation must also say where it lies.
+    # A segmentation must also state its position in the world.
     ".seg.nrrd": partial(check_nrrd, needed=("space", "space directions", "space origin", "kinds")),
     ".nii.gz": check_nifti,
     ".nii": check_nifti,
@@ -132,9 +132,9 @@ def _text_header(path: Path) -> bytes:
 
 
 def _fields(path: Path, header: bytes, separator: str) -> dict[str, str]:
-    """Return the fields of a header by name; the first of two with the same name."""
+    """Return the fields of a header by name; the first of those with the same name."""
     text = header.decode(errors="surrogateescape").replace("\r\n", "\n")
-    # The reading library takes some of them for the end of a line or of the text.
+    # SimpleITK takes some control characters for the end of a line or of the text.
     if re.search(r"[\0-\x08\x0b-\x1f\x7f]", text):
         raise VolumeError(f"{path}: the header is damaged: it contains bytes that are not text")
     lines = [re.split(rf"\s*{separator}\s*", line.strip(), maxsplit=1) for line in text.split("\n")]
@@ -146,7 +146,7 @@ def _check_nrrd_spacing(path: Path, fields: dict[str, str]) -> None:
         check_spacing(path, [_number(word) for word in fields["spacings"].split()])
     elif "space directions" in fields:
         vectors = re.findall(r"\(([^)]*)\)|(none)", fields["space directions"])
-        # The layers of a segmentation have no direction; an axis of space must have one.
+        # The layer axis of a segmentation has no direction; a spatial axis must have one.
         if len(vectors) > 3 and vectors[0][1]:
             vectors = vectors[1:]
         check_spacing(path, [math.hypot(*map(_number, v.split(","))) if v else math.nan for v, _ in vectors])

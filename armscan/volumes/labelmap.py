@@ -21,10 +21,10 @@ TISSUE_LABELS = {name: label for label, name in LABEL_NAMES.items()}
 BACKGROUND = TISSUE_LABELS["background"]
 # Tissues that every labelmap must have.
 LANDMARKS = ("bones", "tendons", "artery")
-# Values this close together are looked up in one table; others are searched for.
+# A range of values below this gets a dense lookup table; a wider one is sorted and searched.
 MAX_TABLE = 65536
 LARGEST_INT64 = 2**63 - 1
-# The whole numbers up to here are exact as 64-bit floats.
+# Integers up to this are exact in a 64-bit float.
 MAX_FLOAT_LABEL = 2**53
 MAX_SHOWN = 8
 
@@ -36,8 +36,8 @@ Source = int | str
 class LabelMap:
     """Mapping from values (of plain labelmaps) or segment names (of .seg.nrrd files) to tissues.
 
-    Several sources may be one tissue: segmentations often number every bone by itself. The value 0 is background where
-    no tissue names it.
+    Several sources may map to one tissue: segmentations often number each bone separately. The value 0 is background
+    unless a tissue lists it.
 
     Args:
         bones: Values and segment names of the bones, in a list or tuple.
@@ -45,11 +45,11 @@ class LabelMap:
         artery: Values and segment names of the ulnar artery.
         nerve: Values and segment names of the median nerve.
         background: Values and segment names to ignore.
-        others: `background` makes every other value background; None refuses a file with other values.
+        others: `background` maps every other value to background; None refuses a file with other values.
 
     Raises:
-        InvalidValueError: If a source is neither a whole number nor a string, stands twice, or a landmark (bones,
-            tendons, artery) has none.
+        InvalidValueError: If a source is neither a whole number nor a string, or is listed twice, or a landmark (bones,
+            tendons, artery) has no source.
     """
 
     bones: tuple[Source, ...] = ()
@@ -87,7 +87,7 @@ class LabelMap:
 
     @cached_property
     def by_source(self) -> dict[Source, int]:
-        """The label, 0 to 4, of each source that is named."""
+        """The label, 0 to 4, of each listed source."""
         return {source: label for tissue, label in TISSUE_LABELS.items() for source in getattr(self, tissue)}
 
     def label_of(self, source: Source) -> int | None:
@@ -98,11 +98,11 @@ class LabelMap:
 
 @dataclass(frozen=True)
 class Found:
-    """Contents of a file.
+    """A value or segment found in a file.
 
     Args:
-        source: Value, or name of the segment.
-        label: Label that it is mapped to, 0 to 4.
+        source: Voxel value, or name of the segment.
+        label: Label that it maps to, 0 to 4.
         n_voxels: Number of its voxels in the file; 0 for an empty segment.
     """
 
@@ -122,7 +122,7 @@ def map_values(
         where: Name of the file, for errors.
 
     Returns:
-        The labels, of the same shape, and what was found, in the order of the values.
+        The labels, of the same shape, and the values found, in ascending order.
 
     Raises:
         VolumeError: If the values are not whole numbers, or the label map does not name one of them.
@@ -151,7 +151,7 @@ def count_values(values: NDArray[np.integer[Any]]) -> dict[int, int]:
         present, n_voxels = np.unique(values, return_counts=True)
         return dict(zip(map(int, present), map(int, n_voxels), strict=True))
     counts = np.zeros(high - low + 1, dtype=np.int64)
-    # Slab by slab: the copies stay small, and it is ten times as fast.
+    # Slab by slab: keeps the copies small, and is ten times as fast.
     for slab in values:
         counts += np.bincount((slab.astype(np.int64) - low).ravel(), minlength=counts.size)
     return {low + int(position): int(counts[position]) for position in np.flatnonzero(counts)}
@@ -183,18 +183,18 @@ def check_landmarks(found: tuple[Found, ...], labels: LabelMap, where: str) -> N
 
 
 def shown(sources: Iterable[Source]) -> str:
-    """Return values or names as they are written in a message, the first few of them."""
+    """Format the first few values or names for a message."""
     return few(map(repr, sources), MAX_SHOWN)
 
 
 def check_whole(values: NDArray[np.generic], where: str) -> NDArray[np.integer[Any]]:
-    """Return voxels of whole-valued floats or integers as integers; raise `VolumeError` for any other."""
+    """Return integer or whole-valued float voxels as integers; raise `VolumeError` for any others."""
     if np.issubdtype(values.dtype, np.integer):
         return values  # type: ignore[return-value]
     if not np.issubdtype(values.dtype, np.floating):
         raise VolumeError(f"{where}: holds values of type {values.dtype}, but a labelmap holds whole numbers")
     low, high = values.min(), values.max()
-    # Written so that a NaN fails it, too.
+    # Written so that NaN fails it, too.
     if not (abs(low) <= MAX_FLOAT_LABEL and abs(high) <= MAX_FLOAT_LABEL and (values == np.floor(values)).all()):
         raise VolumeError(
             f"{where}: holds {values.dtype} values between {low:g} and {high:g} that are not whole numbers: grey "

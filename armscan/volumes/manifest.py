@@ -25,7 +25,7 @@ from armscan.volumes.plane import ManipulatorAction
 if TYPE_CHECKING:
     from armscan.volumes.manifest_schema import Manifest, VolumeEntry
 
-# The last one is of an older form: nothing but the entries of the volumes.
+# The last one is an older format: only the entries of the volumes.
 MANIFEST_NAMES = ("manifest.yaml", "manifest.yml", "manifest.json", "optimal_actions.json")
 ENTRIES_ONLY = MANIFEST_NAMES[-1]
 NEW_MANIFEST = MANIFEST_NAMES[0]
@@ -57,14 +57,14 @@ def find_manifest(folder: Path) -> Path | None:
 
 def read_manifest(path: Path) -> Manifest:
     """Read and check a manifest; an error names the file, the entry, the key, the value and what is allowed."""
-    # Deferred: who steps through phantoms reads no manifest.
+    # Deferred: phantoms have no manifest.
     from armscan.volumes.manifest_schema import check_manifest
 
     return check_manifest(_load(path), path)
 
 
 def volume_entries(manifest: Manifest, files: Mapping[str, Path], path: Path | None) -> dict[str, VolumeEntry]:
-    """Return the entry of each volume file, which must have one; empty ones where the manifest has no `volumes`."""
+    """Return the entry of each volume file: required if the manifest has `volumes`, else empty."""
     from armscan.volumes.manifest_schema import VolumeEntry
 
     if manifest.volumes is None:
@@ -90,7 +90,7 @@ def record_planes(folder: str | Path, planes: Mapping[str, tuple[ManipulatorActi
         The manifest.
 
     Raises:
-        InvalidValueError: If `planes` is something else, or a score is not in [-1, 0].
+        InvalidValueError: If `planes` is not such a mapping, or a score is not in [-1, 0].
         ManifestError: If the manifest is damaged, or the folder holds no such volume.
         VolumeError: If the folder cannot be used.
     """
@@ -99,7 +99,7 @@ def record_planes(folder: str | Path, planes: Mapping[str, tuple[ManipulatorActi
     files = volume_files(folder)
     if unknown := [name for name in recorded if name not in files]:
         raise ManifestError(f"{folder}: a plane is given for {few(unknown)}, but the folder holds {few(files)}")
-    # What two write at the same time, one would lose. The lock is not in the folder, where it would stay behind.
+    # Concurrent writers would overwrite each other. The lock file lies elsewhere, so that none is left in the folder.
     lock = Path(tempfile.gettempdir()) / f"armscan-{sha256(os.fsencode(folder.resolve()))[:16]}.lock"
     with FileLock(lock):
         return _recorded(folder, recorded, files)
@@ -121,7 +121,7 @@ def _recorded(folder: Path, recorded: dict[str, dict[str, Any]], files: dict[str
         entries = document["volumes"]
         for name, keys in recorded.items():
             entry = entries.get(name, {})
-            # In YAML two entries can be one object.
+            # With YAML aliases two entries can be one object.
             is_shared = any(other is entry for key, other in entries.items() if key != name)
             entries[name] = dict(entry) if is_shared else entry
             entries[name].update(keys)
@@ -182,7 +182,7 @@ def _load(path: Path) -> Document:
 
 
 def _without_duplicates(pairs: list[tuple[str, Any]]) -> Document:
-    """Refuse duplicate keys, of which JSON keeps only the last one."""
+    """Build an object, refusing duplicate keys, of which `json` would keep the last."""
     check_no_duplicates([key for key, _ in pairs])
     return dict(pairs)
 
@@ -191,6 +191,6 @@ def _round_trip() -> YAML:
     """Return a reader and writer of YAML that keeps comments, order and quotes."""
     editor = YAML()
     editor.preserve_quotes, editor.width = True, 4096
-    # YAML 1.1, which manifests are read as, wants a dot in a number with an exponent.
+    # Manifests are read as YAML 1.1, in which a number with an exponent needs a dot.
     editor.representer.add_representer(float, SafeRepresenter.represent_float)
     return editor

@@ -43,13 +43,13 @@ Overlap = Literal["refuse", "first", "last"]
 
 
 class _Strict(BaseModel):
-    """Takes no other keys, and no value for another one."""
+    """Model that accepts no unknown keys and converts no values."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, arbitrary_types_allowed=True)
 
 
 class _Settings(_Strict):
-    """Keys of an entry and of the whole manifest; each key's description states its allowed values."""
+    """Keys allowed in an entry and at the top of a manifest; a key's description states its allowed values."""
 
     labels: Labels | None = None
     orientation: Orientation = None
@@ -118,13 +118,13 @@ def check_manifest(document: dict[str, Any], path: Path) -> Manifest:
         return Manifest.model_validate(document)
     except ValidationError as error:
         raise ManifestError(_in_one_line(error, path)) from error
-    # What is nested in itself, or too deeply to be looked at.
+    # A document that contains itself, or is nested too deeply.
     except RecursionError as error:
         raise ManifestError(f"{path}: the manifest is nested too deeply") from error
 
 
 def _in_one_line(error: ValidationError, path: Path) -> str:
-    """Name the file, the entry, the key, the value received and what is allowed, of the first mistake."""
+    """Describe the first mistake: the file, the entry, the key, the value received and what is allowed."""
     mistake = error.errors(include_url=False)[0]
     kind, received, place = mistake["type"], reprlib.repr(mistake["input"]), list(mistake["loc"])
     model: type[BaseModel] = Manifest

@@ -1,8 +1,8 @@
-"""Volumes kept on disk as plain arrays that processes map, so that a machine holds their voxels once.
+"""Volumes on disk as plain arrays that processes memory-map, so that a machine holds their voxels in memory once.
 
-A file is a line that says what it is, a line with the SHA-256 of all that follows, a line of JSON, and from the next
-page on the voxels. It is written beside its place and renamed, and checked whole whenever it is opened: a file that is
-damaged, torn or another version's is as good as none.
+A file is a magic line, a line with the SHA-256 of all that follows, a line of JSON and, from the next page on, the
+voxels. It is written under a temporary name and renamed, and verified in full whenever it is opened: a damaged or
+partial file, or another version's, counts as missing.
 """
 
 from __future__ import annotations
@@ -28,26 +28,26 @@ from armscan.volumes.volume import LabelVolume
 
 MAGIC = b"armscan volume 2\n"
 OF_VOLUMES = ".volume"
-# With the order of the voxels: an earlier version, which has another, keeps its own files.
+# Includes the voxel order: earlier versions, which used another, keep their own files.
 SUFFIX = f".yxz{OF_VOLUMES}"
 SHA256_CHARACTERS = 64
-# Of the folder: those that nobody has opened for longest make way. Mapped voxels outlive their file.
+# Limit of the folder's size: the least recently opened files are evicted. Mapped voxels outlive their file.
 DEFAULT_GIB = 16.0
 LIMIT_VARIABLE = "ARMSCAN_CACHE_GIB"
-# Rather than make what another process is making; one that was stopped meanwhile must not stop all others.
+# How long to wait for a process that is making a volume; a suspended one must not block all others.
 MAX_WAITED_S = 60.0
 UNFINISHED_FOR_S = 3600.0
 
 Made = tuple[LabelVolume, Any]
-"""A volume, and what else is to be kept of it, as JSON has it."""
+"""A volume, and data to keep with it, of JSON's types."""
 
 
 def mapped_volume(path: Path, make: Callable[[], Made]) -> Made:
-    """Return a volume from its file, made and kept there if there is no sound one.
+    """Return a volume from its file; without an intact file, make the volume and write it.
 
     Args:
-        path: Place of the file; its name must hold everything that the volume depends on.
-        make: Function that makes the volume, and the facts to keep beside it.
+        path: Path of the file; its name must encode everything that the volume depends on.
+        make: Function that makes the volume, and the data to keep with it.
 
     Raises:
         OSError: If the file cannot be written.
@@ -67,15 +67,15 @@ def mapped_volume(path: Path, make: Callable[[], Made]) -> Made:
 
 
 def open_mapped(path: Path) -> Made | None:
-    """Return a volume with the file's own voxels, and the facts beside it; None if there is no intact file.
+    """Return a volume with the file's voxels, mapped, and the data kept with it; None if there is no intact file.
 
     Args:
-        path: Place of the file.
+        path: Path of the file.
     """
     try:
         with path.open("rb") as file:
             contents = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-            # Another user's cache may only be read.
+            # Another user's cache may be read-only.
             with contextlib.suppress(OSError):
                 os.utime(file.fileno())
         start = len(MAGIC) + SHA256_CHARACTERS + 1
@@ -84,7 +84,7 @@ def open_mapped(path: Path) -> Made | None:
             return None
         end = contents.find(b"\n", start) + 1
         kept = json.loads(contents[start:end])
-    # An empty file cannot be mapped, and JSON of a sound file is what this version has written.
+    # An empty file cannot be mapped. An intact file's JSON needs no check: this version has written it.
     except (OSError, ValueError):
         return None
     labels = np.frombuffer(contents, np.uint8, offset=_next_page(end))
@@ -128,7 +128,7 @@ def _next_page(n_bytes: int) -> int:
 
 
 def _make_room(kept: Path) -> None:
-    """Remove the least recently opened files until the folder is within its limit, and those of killed processes."""
+    """Evict the least recently opened files until the folder is within its limit, and killed processes' leftovers."""
     limit = limit_bytes()
     for unfinished in kept.parent.glob(f".*{OF_VOLUMES}.*.{UNFINISHED}"):
         with contextlib.suppress(OSError):
@@ -148,10 +148,10 @@ def _make_room(kept: Path) -> None:
 
 
 def limit_bytes() -> float:
-    """Return how large a folder of volumes may become: `$ARMSCAN_CACHE_GIB`, default: 16.
+    """Return the size limit of a folder of volumes, in bytes: `$ARMSCAN_CACHE_GIB` GiB, default: 16.
 
     Raises:
-        InvalidValueError: If that is not a number of 0 or more.
+        InvalidValueError: If the variable is not a number of 0 or more.
     """
     word = os.environ.get(LIMIT_VARIABLE) or str(DEFAULT_GIB)
     try:
@@ -166,7 +166,7 @@ def limit_bytes() -> float:
 
 
 def kept_if_possible(path: Path, make: Callable[[], Made]) -> Made:
-    """Return a volume as `mapped_volume` does, or one of this process alone where the file cannot be written."""
+    """Return a volume as `mapped_volume` does, or one of this process alone if the file cannot be written."""
     try:
         return mapped_volume(path, make)
     except OSError as error:

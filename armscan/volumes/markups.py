@@ -1,4 +1,4 @@
-"""Planes to and from 3D Slicer: markups files (`.mrk.json`) in world coordinates, written and read back.
+"""Read and write planes as markups files of 3D Slicer (`.mrk.json`), in world coordinates.
 
 World coordinates are millimetres in LPS (X to the left, Y to the back, Z to the head), the frame of a volume's `origin`
 and `direction`.
@@ -26,17 +26,17 @@ SCHEMA = (
     "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/"
     "markups-schema-v1.0.3.json#"
 )
-# Nearer to the volume's floor than this, in depth per mm, a plane meets it too far away to begin there.
+# In mm of depth per mm: a flatter plane meets the volume's floor, where every plane begins, too far away.
 MIN_SLOPE = 1e-3
-# A rectangle is a slice of the volume where their sizes agree to this.
+# A rectangle counts as a slice of the volume if their sizes agree to this.
 SAME_SIZE_MM = 0.01
 ROUNDING_MM = 1e-3
 
 
 def write_markup(path: str | Path, volume: LabelVolume, action: ManipulatorAction, name: str = "optimal plane") -> None:
-    """Write a plane as the rectangle that its slice fills in the volume as Slicer shows it.
+    """Write a plane as the rectangle that its slice covers where Slicer shows the volume.
 
-    The rectangle's x axis runs across and its y axis in depth; the normal makes them right-handed.
+    The rectangle's x axis runs across and its y axis in depth; the normal completes a right-handed frame.
 
     Args:
         path: File to write, ending in `.mrk.json`, in an existing folder.
@@ -45,7 +45,7 @@ def write_markup(path: str | Path, volume: LabelVolume, action: ManipulatorActio
         name: Name of the plane in Slicer.
 
     Raises:
-        InvalidValueError: If an argument is of another type.
+        InvalidValueError: If an argument has the wrong type.
         MarkupError: If the file cannot be written.
     """
     path = check_path("the markups file", path)
@@ -66,9 +66,9 @@ def write_markup(path: str | Path, volume: LabelVolume, action: ManipulatorActio
 def read_markup(path: str | Path, volume: LabelVolume) -> ManipulatorAction:
     """Read the plane of a markups file, written by `write_markup` or drawn in Slicer, in LPS or RAS.
 
-    It is the same plane as a set of points. Where the file shows a rectangle of a slice's size, its middle stays the
-    middle of the slice; otherwise the slice is placed about the volume's middle. How the rectangle is turned within its
-    plane, and where it lies in depth, is left out: an action has no such components.
+    The result is the same plane as a set of points. A rectangle of a slice's size keeps its position across; any other
+    is centred on the volume. The rectangle's rotation within its plane and its position in depth are dropped: an action
+    has no such components.
 
     Args:
         path: File with one plane; it may hold other markups.
@@ -78,8 +78,8 @@ def read_markup(path: str | Path, volume: LabelVolume) -> ManipulatorAction:
         The plane in the volume's frame, rz and rx within +-90 degrees, its origin (tx, ty) within the volume.
 
     Raises:
-        InvalidValueError: If an argument is of another type.
-        MarkupError: Naming the file and the key, if the file does not say which plane, or no action is this plane.
+        InvalidValueError: If an argument has the wrong type.
+        MarkupError: Naming the file and the key, if the file does not define a plane, or no action describes it.
     """
     path = check_path("the markups file", path)
     if not isinstance(volume, LabelVolume):
@@ -87,7 +87,7 @@ def read_markup(path: str | Path, volume: LabelVolume) -> ManipulatorAction:
     plane = read_slicer_plane(path)
     origin_mm, axes = np.asarray(volume.origin), volume.direction
     point_mm, normal = np.linalg.solve(axes, plane.point_mm - origin_mm), axes.T @ plane.normal
-    # Of a plane's two descriptions the one that looks along the arm, so that the picture is not mirrored.
+    # Of the plane's two normals, the one that points along the arm, so that the slice is not mirrored.
     normal *= -1.0 if normal[1] < 0 else 1.0
     rx = np.arctan2(normal[2], np.hypot(normal[0], normal[1]))
     rz = np.arctan2(-normal[0], normal[1])
@@ -97,12 +97,12 @@ def read_markup(path: str | Path, volume: LabelVolume) -> ManipulatorAction:
     if in_depth[2] < MIN_SLOPE:
         raise MarkupError(f"{where} along the palm of {volume.name}, but it must cross the arm")
     slice_origin_mm = point_mm - turned.matrix @ _slice_centre(volume)
-    # Whether the rectangle is as large as the volume's slices are.
+    # Only a rectangle of a slice's size fixes the position across.
     size_mm = (volume.size_mm[0], volume.size_mm[2])
     if plane.size_mm is None or not np.allclose(plane.size_mm, size_mm, rtol=0.0, atol=SAME_SIZE_MM):
         slice_origin_mm += across @ (np.array(volume.centre_mm) - point_mm) * across
     slice_origin_mm -= slice_origin_mm[2] / in_depth[2] * in_depth
-    # What the file's rounding has moved out of the volume is moved back.
+    # Move an origin back that rounding in the file has moved out of the volume.
     within_mm = np.clip(slice_origin_mm[:2], 0.0, volume.size_mm[:2])
     tx, ty = np.where(np.abs(within_mm - slice_origin_mm[:2]) < ROUNDING_MM, within_mm, slice_origin_mm[:2])
     action = ManipulatorAction(turned.rotation, (float(tx), float(ty)))
@@ -123,7 +123,7 @@ def _markup(volume: LabelVolume, action: ManipulatorAction, name: str) -> dict[s
     orientation = np.column_stack([x_axis, y_axis, np.cross(x_axis, y_axis)])
     base_to_node = np.eye(4)
     base_to_node[:3, :3], base_to_node[:3, 3] = orientation, centre
-    # No objectToBase: without one Slicer takes the identity (which it writes as diag(-1, -1, 1, 1) where it uses LPS).
+    # No objectToBase: without it Slicer uses the identity (which it writes as diag(-1, -1, 1, 1) in LPS).
     return {
         "type": "Plane",
         "name": name,
@@ -139,7 +139,7 @@ def _markup(volume: LabelVolume, action: ManipulatorAction, name: str) -> dict[s
         "size": [across_mm, depth_mm, 0.0],
         "planeBounds": [-across_mm / 2, across_mm / 2, -depth_mm / 2, depth_mm / 2],
         "controlPoints": [{"id": "1", "label": name, "position": centre.tolist(), "positionStatus": "defined"}],
-        # With handles, so that who disagrees can move it at once.
+        # With handles, so that it can be corrected at once.
         "display": {"visibility": True, "opacity": 1.0, "handlesInteractive": True},
     }
 

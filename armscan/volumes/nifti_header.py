@@ -1,7 +1,7 @@
 """Headers of NIfTI files, checked before SimpleITK reads the file.
 
-SimpleITK fills the missing end of a truncated file with zeros, shifts the image where its voxels begin within the
-header, makes voxels that are NaN or infinite 0, and prints pages where the place in the world is no number.
+SimpleITK pads a truncated file with zeros, shifts the image if its voxels begin within the header, turns NaN and
+infinite voxels into 0, and prints pages of output if the qform or sform is not finite.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ import numpy as np
 from armscan.errors import VolumeError
 from armscan.volumes.stored_voxels import GZIP, StoredVoxels, check_spacing, check_stored, count_voxels, pieces
 
-# Types of voxels by their codes; the header's own figure of their bytes can be anything and is not what is read.
+# Voxel types by their code; the header's own `bitpix` may be anything, and is ignored when voxels are read.
 TYPES = {2: "u1", 4: "i2", 8: "i4", 16: "f4", 64: "f8", 256: "i1", 512: "u2", 768: "u4", 1024: "i8", 1280: "u8"}
-# By what a header, NIfTI-1 or NIfTI-2, calls its own size: its fields as `struct` reads them, and where they stand.
+# By the header's size, NIfTI-1 or NIfTI-2: the `struct` format and the offset of each field.
 LAYOUTS = {
     348: {
         "magic": ("4s", 344),
@@ -43,7 +43,7 @@ MAX_OFFSET = 1 << 24
 
 
 def check_nifti(path: Path) -> None:
-    """Raise `VolumeError` if a NIfTI file is damaged, its place in the world no number, or a voxel not finite."""
+    """Raise `VolumeError` if a NIfTI file is damaged, or its qform, its sform or a voxel is not finite."""
     compression = GZIP if path.suffix == ".gz" else None
     header = b""
     with path.open("rb") as file:
@@ -62,7 +62,7 @@ def check_nifti(path: Path) -> None:
     )
     if magic not in MAGIC:
         raise VolumeError(f"{path}: the header is damaged, or of a pair of files (.hdr and .img), which is not read")
-    # The four bytes behind a header say whether extensions follow.
+    # The four bytes after a header say whether extensions follow.
     if not size + 4 <= begin < MAX_OFFSET or begin != int(begin):
         raise VolumeError(f"{path}: the header ends at byte {size + 4}, but its voxels begin at byte {begin:g}")
     if not 1 <= n_dimensions <= 7 or code not in TYPES:
@@ -70,7 +70,7 @@ def check_nifti(path: Path) -> None:
             f"{path}: has {n_dimensions} dimensions and voxels of type {code}, but a labelmap has 3, and integers or "
             "floats"
         )
-    # Spacings of axes that the image does not have are often 0, and mean nothing.
+    # The spacings of unused axes are often 0 and mean nothing.
     check_spacing(path, fields["steps"][1:4][:n_dimensions])
     if not all(map(math.isfinite, fields["place"])):
         raise VolumeError(f"{path}: its place in the world (qform, sform) holds a NaN or an infinity")

@@ -1,4 +1,4 @@
-"""Axes of a file: their order, their standard orientation, the part of them that is kept."""
+"""Axes of a file: their order, their anatomical orientation, and the crop along them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ AXES = "xyz"
 # Each world axis runs from the first towards the second: right, left, anterior, posterior, inferior, superior.
 WORLD_AXES = ("RL", "AP", "IS")
 
-# From and to along each axis that is cropped, in mm.
+# Range (from, to) in mm along each cropped axis.
 Crop = dict[str, tuple[float, float]]
 
 
@@ -57,7 +57,7 @@ def check_crop(value: Any) -> Crop | None:
 
 
 def orientation_of(direction: FloatArray) -> str:
-    """Return the directions of the axes, such as 'LPS'; oblique axes count by their largest components.
+    """Return the directions of the axes, such as 'LPS'; an oblique axis gets the letter of its largest component.
 
     Args:
         direction: Directions of the axes in the world (left, posterior, superior), as columns, shape (3, 3).

@@ -51,7 +51,7 @@ class ManipulatorAction:
 
     @classmethod
     def of_finite(cls, rotation: tuple[float, float], translation: tuple[float, float]) -> Self:
-        """Build the action from plain floats that are known to be finite; for each step that is taken."""
+        """Build the action from plain floats known to be finite, without validation: the fast path of each step."""
         action = object.__new__(cls)
         action.__dict__.update(rotation=rotation, translation=translation)
         return action
@@ -88,10 +88,10 @@ def wrap_deg(angle_deg: float) -> float:
 
 
 def shift_into(action: ManipulatorAction, bounds_mm: tuple[float, float]) -> ManipulatorAction | None:
-    """Slide the plane's origin along the plane until (tx, ty) lies in [0, bounds_mm], by the shortest way.
+    """Slide the plane's origin across, within the plane and as little as possible, until (tx, ty) is in [0, bounds_mm].
 
     Returns:
-        The same plane with its picture shifted across, or None if the plane misses the box altogether.
+        The same plane with its slice shifted across; None if no shift brings the origin into the bounds.
     """
     direction = action.matrix[:2, 0].tolist()
     lowest, highest = -np.inf, np.inf

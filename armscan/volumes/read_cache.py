@@ -1,4 +1,4 @@
-"""Labelmaps that were read, kept in the machine's cache: read once, and in memory once for all processes."""
+"""Cache of labelmaps on this machine: each is read once, and held in memory once for all processes."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ from armscan.volumes.resampling import Spacing, resample
 from armscan.volumes.summary import StoredFile
 from armscan.volumes.volume import LabelVolume
 
-# What volumes are made by: changed code never meets what the old one has read.
+# Modules that volumes depend on: a change in one invalidates the cache.
 CODE = (
     *(header_checks, labelmap, nifti_header, orientation, reading, resampling, segmentation, stored_voxels, summary),
     plane,
     volume,
 )
-# A text header that says so has its voxels in another file, or may have.
+# A text header that matches has its voxels in another file, or may have.
 ELSEWHERE = {
     "nrrd": re.compile(rb"(?im)^data ?file"),
     "mha": re.compile(rb"\A(?!.*^ElementDataFile *= *LOCAL *\r?\n)", re.DOTALL | re.MULTILINE | re.IGNORECASE),
@@ -50,12 +50,12 @@ def read_kept(
 ) -> tuple[LabelVolume, StoredFile]:
     """Read a volume as `read_stored` does, or find it in the cache.
 
-    It is found by the contents of its file and all that it is read with. A file that leaves its voxels to another one
-    is read anew.
+    The cache key covers the file's name and contents, the options and the labelled plane. A file whose voxels lie in
+    another file is not cached.
 
     Args:
         path: File of the volume.
-        options: Reading options, such as crop and orientation; the cache's key holds them.
+        options: Reading options, such as crop and orientation.
         optimal_action: Labelled plane, in the volume's frame.
 
     Raises:
@@ -79,13 +79,13 @@ def read_kept(
 
 def resample_kept(labelled: LabelVolume, spacing: Spacing) -> LabelVolume:
     """Resample a volume as `resample` does, or find it in the cache."""
-    way_back = labelled.origin, labelled.direction.tolist()
-    path = _place("resampled", labelled.name, labelled.fingerprint, way_back, spacing)
+    world_frame = labelled.origin, labelled.direction.tolist()
+    path = _place("resampled", labelled.name, labelled.fingerprint, world_frame, spacing)
     return kept_if_possible(path, lambda: (resample(labelled, spacing), None))[0]
 
 
 def _digest(path: Path) -> str | None:
-    """Return the SHA-256 of a file that holds its voxels itself; None for others, and for those that cannot be read."""
+    """Return the SHA-256 of a file that holds its own voxels; None for any other, or if it cannot be read."""
     try:
         with path.open("rb") as file:
             elsewhere = ELSEWHERE.get(path.suffix[1:])
@@ -93,7 +93,7 @@ def _digest(path: Path) -> str | None:
                 return None
             file.seek(0)
             return hashlib.file_digest(file, "sha256").hexdigest()
-    # Reading says what is wrong with it.
+    # Reading it reports what is wrong.
     except (OSError, ValueError):
         return None
 

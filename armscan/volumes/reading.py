@@ -1,4 +1,4 @@
-"""From image files to labelmap volumes."""
+"""Read image files as labelmap volumes."""
 
 from __future__ import annotations
 
@@ -59,29 +59,28 @@ def read_volume(
 ) -> LabelVolume:
     """Read a labelmap from .nii, .nii.gz, .nrrd, .mha or .mhd, or a segmentation of 3D Slicer from .seg.nrrd.
 
-    Where a voxel lies in the world stays as the file says, however the array is turned and cropped.
+    Voxels keep the world coordinates of the file, however the array is reoriented and cropped.
 
     Args:
         path: File to read.
-        name: Name of the volume. None: that of the file.
+        name: Name of the volume. None: the file's name.
         optimal_action: Labelled plane, in the frame of the volume as returned.
         labels: Mapping from values or segments to tissues. None: values are the labels of `LabelVolume`, and segments
             are named bones, tendons, artery, nerve or background.
-        orientation: Directions that the file's axes are turned towards first, such as 'LPS'; None leaves them as they
-            are.
-        axes: Axes of the arm that the first, second and third axis are then; in 'xyz', X runs across the palm, Y along
-            the arm and Z through the depth.
-        crop_mm: Part of the volume to keep at last: a range in mm from the first voxel's centre, for any of the axes x,
-            y and z. Voxels whose centres lie in it stay; the first of them is the origin of the volume's frame.
+        orientation: Orientation to bring the image into first, such as 'LPS'. None: as in the file.
+        axes: Axes of the arm that the image's first, second and third axis then run along: X across the palm, Y along
+            the arm, Z through the depth. Default: 'xyz'.
+        crop_mm: Part of the volume to keep, cropped last: a range in mm from the first voxel's centre, for any of the
+            axes x, y and z. Voxels whose centres lie in it are kept; the first of them becomes the frame's origin.
         overlap: Rule for voxels in segments of different tissues: `refuse` raises, `first` and `last` take the tissue
             of the first or last segment in the file.
 
     Returns:
-        The volume, its array in the order x, y, z.
+        The volume, its array indexed [x, y, z].
 
     Raises:
-        VolumeError: Naming the file, if it is missing, damaged, truncated, no 3-D scalar image, no labelmap, or has a
-            spacing that is not finite and positive, and if an argument is not as above.
+        VolumeError: Naming the file, if it is missing, damaged, truncated, not a 3-D scalar image, not a labelmap, or
+            has a spacing that is not finite and positive; or if an argument is not as above.
     """
     path = check_path("the volume's file", path)
     try:
@@ -124,7 +123,7 @@ def read_stored(
 
 def _read_labels(path: Path, options: ReadingOptions) -> tuple[SimpleITK.Image, tuple[Found, ...]]:
     """Return the file as a SimpleITK image of the labels 0 to 4, and the values found in it."""
-    # Deferred: it takes long to load, and who steps through phantoms never needs it.
+    # Deferred: slow to import, and phantoms do not need it.
     import SimpleITK
 
     suffix = next((suffix for suffix in CHECKS if path.name.endswith(suffix)), None)
@@ -134,7 +133,7 @@ def _read_labels(path: Path, options: ReadingOptions) -> tuple[SimpleITK.Image, 
     try:
         if not path.is_file():
             raise VolumeError(f"{path}: there is no such file")
-        # A name may hold any bytes; by one that is not text SimpleITK would end the process.
+        # A file name may hold any bytes; SimpleITK would abort the process on one that is not valid text.
         str(path).encode()
         CHECKS[suffix](path)
         if suffix == SEGMENTATION_SUFFIX:
@@ -149,7 +148,7 @@ def _read_labels(path: Path, options: ReadingOptions) -> tuple[SimpleITK.Image, 
         reason = " ".join(str(error).split("ERROR:")[-1].split())[:200]
         raise VolumeError(f"{path}: the file is truncated or damaged, or no image ({reason})") from error
     if stored.GetDimension() == 4 and stored.GetSize()[3] == 1:
-        # A single point in time.
+        # A single time point.
         stored = stored[:, :, :, 0]
     if stored.GetDimension() != 3 or stored.GetNumberOfComponentsPerPixel() != 1:
         raise VolumeError(
@@ -180,7 +179,7 @@ def _image(labels: NDArray[np.uint8], matrix: FloatArray, path: Path) -> SimpleI
 def _in_order(
     image: SimpleITK.Image, options: ReadingOptions, path: Path
 ) -> tuple[NDArray[np.uint8], FloatArray, FloatArray, FloatArray]:
-    """Orient an image, bring its axes into the arm's order and crop it: labels, spacing, origin and direction."""
+    """Orient an image, reorder its axes and crop it; return labels, spacing, origin and direction."""
     import SimpleITK
 
     if options.orientation is not None:
@@ -196,7 +195,7 @@ def _in_order(
 
 
 def _kept(crop_mm: Crop | None, axis: str, n_voxels: int, step_mm: float, path: Path) -> slice:
-    """Return which voxels along an axis stay."""
+    """Return the range of voxels to keep along an axis."""
     if crop_mm is None or axis not in crop_mm:
         return slice(0, n_voxels)
     low, high = crop_mm[axis]

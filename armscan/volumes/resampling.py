@@ -1,4 +1,4 @@
-"""Volumes of different spacing, brought to one."""
+"""Resample volumes to a common spacing."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from armscan.volumes.volume import LabelVolume
 
 Spacing = tuple[float, float, float]
 
-# More than any scanner gives; a spacing that asks for more is a mistake.
+# More than any scanner produces: a spacing that needs more is a mistake.
 MAX_VOXELS = 2**30
 
 
@@ -23,24 +23,24 @@ def finest_spacing(volumes: Iterable[LabelVolume]) -> Spacing:
 
 
 def resample(volume: LabelVolume, spacing: Spacing) -> LabelVolume:
-    """Resample a volume by the nearest neighbour.
+    """Resample a volume by nearest neighbour.
 
-    The first voxel's centre stays where it is, so that the volume's frame, and with it every plane, stays the same.
+    The first voxel's centre stays fixed, and with it the volume's frame and every plane.
 
     Args:
         volume: Volume to resample; returned unchanged if it already has the spacing.
         spacing: Voxel spacing (sx, sy, sz) in mm, each above 0.
 
     Returns:
-        The volume with as many voxels of that spacing as have their centres in it.
+        The volume, with every voxel of that spacing whose centre lies within the original.
 
     Raises:
         VolumeError: If the volume would have more than 2^30 voxels.
     """
-    # Files keep spacings with some six digits.
+    # Files store spacings to about six digits.
     if np.allclose(volume.spacing, spacing, rtol=1e-5, atol=0.0):
         return volume
-    # Deferred: it takes long to load, and few folders need it.
+    # Deferred: slow to import, and few folders need it.
     import SimpleITK
 
     # A centre on the far edge itself is no longer inside.
@@ -51,7 +51,7 @@ def resample(volume: LabelVolume, spacing: Spacing) -> LabelVolume:
             f"voxels, but it must have at most {MAX_VOXELS}"
         )
     size = np.maximum(1, np.ceil(n_voxels - 1e-6)).astype(int).tolist()
-    # In the volume's own frame: the way to world coordinates is the same before and after.
+    # In the volume's own frame: its transform to world coordinates does not change.
     image = SimpleITK.GetImageFromArray(np.ascontiguousarray(volume.labels.transpose(2, 1, 0)))
     image.SetSpacing(volume.spacing)
     unmoved, nearest = SimpleITK.Transform(), SimpleITK.sitkNearestNeighbor

@@ -15,7 +15,7 @@ from armscan.utils.validation import check_numbers
 from armscan.volumes.plane import ManipulatorAction, rotation_matrix, wrap_deg
 
 MAX_SHIFT_MM = 1e6
-# The maps of a volume as it was read; see `RigidTransform.maps`.
+# The maps of an unmoved volume; see `RigidTransform.maps`.
 NO_MAPS = np.empty((0, 3, 4))
 
 
@@ -67,7 +67,7 @@ class RigidTransform:
         check_numbers("rotation", self.rotation, 2, "(rz, rx) in degrees")
         shift_mm = check_numbers("translation", self.translation, 2, "(tx, ty) in mm")
         centre_mm = check_numbers("centre_mm", self.centre_mm, 3, "(x, y, z) in mm")
-        # The differences of numbers much larger are no numbers any more.
+        # Differences of much larger numbers would overflow to NaN.
         if max(map(abs, shift_mm + centre_mm)) > MAX_SHIFT_MM:
             raise InvalidValueError(
                 f"translation is {shift_mm} and centre_mm is {centre_mm}, but each must be within +-{MAX_SHIFT_MM:g} mm"
@@ -80,14 +80,14 @@ class RigidTransform:
 
     @cached_property
     def offset_mm(self) -> FloatArray:
-        """The b of the affine form T(q) = R q + b."""
+        """The offset b of the affine form T(q) = R q + b, in mm."""
         centre_mm: FloatArray = np.asarray(self.centre_mm)
         offset_mm: FloatArray = centre_mm + np.array([*self.translation, 0.0]) - self.matrix @ centre_mm
         return offset_mm
 
     @cached_property
     def maps(self) -> FloatArray:
-        """The affine maps (A | b) that take a point into the unmoved volume, the last one first, shape (n, 3, 4)."""
+        """The affine maps (A | b) from the moved to the unmoved volume, shape (n, 3, 4); the last is applied first."""
         return np.column_stack([self.matrix, self.offset_mm])[None]
 
     def plane_map(self, action: ManipulatorAction) -> tuple[FloatArray, FloatArray]:
@@ -97,8 +97,8 @@ class RigidTransform:
     def inverse_plane(self, action: ManipulatorAction) -> ManipulatorAction:
         """Return the plane of the moved volume that shows the same slice as `action` in the unmoved one.
 
-        The result is the same set of points. Where the motion turns about X as well, the picture may be turned and
-        shifted within the plane, because a `ManipulatorAction` has neither a rotation about Y nor a shift in depth.
+        The result covers the same points. If the motion also rotates about X, the slice may be rotated and shifted
+        within the plane, because a `ManipulatorAction` has neither a rotation about Y nor a shift in depth.
 
         Raises:
             InvalidValueError: If the moved plane never meets the volume's floor z = 0, where every plane begins.
@@ -106,7 +106,7 @@ class RigidTransform:
         n_x, n_y, n_z = (self.matrix.T @ action.normal).tolist()
         x_mm, y_mm, z_mm = (self.matrix.T @ (action.offset_mm - self.offset_mm)).tolist()
         rx, rz = math.asin(min(max(n_z, -1.0), 1.0)), math.atan2(-n_x, n_y)
-        # The same plane has two descriptions; the one on the same side as `action` keeps the picture upright.
+        # A plane has two normals; the one on the same side as `action` keeps the slice upright.
         if math.cos(math.radians(action.rotation[1])) < 0:
             rx, rz = math.pi - rx, math.atan2(n_x, -n_y)
         rotation = wrap_deg(math.degrees(rz)), wrap_deg(math.degrees(rx))

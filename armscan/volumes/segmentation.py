@@ -32,7 +32,7 @@ def read_segmentation(
 ) -> tuple[NDArray[np.uint8], FloatArray, tuple[Found, ...]]:
     """Read a segmentation and map its segments to the labels 0 to 4 by their names.
 
-    Segments of one tissue may overlap, and so may any segment and one that is background. Where segments of different
+    Segments of one tissue may overlap, and so may a background segment and any other. Where segments of different
     tissues share a voxel, `overlap` decides.
 
     Args:
@@ -44,7 +44,7 @@ def read_segmentation(
 
     Returns:
         The labels over the file's axes, the 4 x 4 matrix from their indices to world coordinates (left, posterior,
-        superior) in mm, and what was found.
+        superior) in mm, and the segments found.
 
     Raises:
         VolumeError: Naming the file, if it is damaged, a segment is not mapped, or segments overlap.
@@ -84,11 +84,11 @@ def _contents(path: Path) -> dict[str, Any]:
 
 
 def _segments(stored: list[dict[str, Any]], n_layers: int, labels: LabelMap | None, path: Path) -> list[Segment]:
-    """Return the segments in the order of the file; all of them must be mapped, and each lie in a layer alone."""
+    """Return the segments in the order of the file; each must be mapped, and have its own value in its layer."""
     segments, unnamed, places = [], [], set()
     for position, each in enumerate(stored):
         name = str(each.get("name", each["id"]))
-        # Before Slicer 4.11 there was one layer a segment, in which it had the value 1.
+        # Before Slicer 4.11 each segment had a layer of its own, with the value 1.
         layer, value = each.get("layer", position), each.get("labelValue", 1)
         if not 0 <= layer < n_layers or value == 0 or (layer, value) in places:
             raise VolumeError(
@@ -115,7 +115,7 @@ def _segments(stored: list[dict[str, Any]], n_layers: int, labels: LabelMap | No
 
 
 def _check_strays(segments: list[Segment], counts: list[dict[int, int]], labels: LabelMap | None, path: Path) -> None:
-    """Raise `VolumeError` if voxels belong to no segment, unless all that is not named is to be background."""
+    """Raise `VolumeError` if voxels belong to no segment, unless the label map makes others background."""
     if labels is not None and labels.others == "background":
         return
     for layer, present in enumerate(counts):

@@ -1,7 +1,7 @@
 """Planes in markups files of 3D Slicer, read as Slicer reads them.
 
-What Slicer shows of a plane follows from its `planeType`: from its `controlPoints` and, for `pointNormal`, from the
-axes in `baseToNode`. It writes `center` and `normal` as well, for other readers. After its schema,
+Slicer derives the plane that it shows from `controlPoints`, by the rule of `planeType`, and for `pointNormal` from the
+axes in `baseToNode`, too. It writes `center` and `normal` only for other readers. Source: its schema,
 markups-schema-v1.0.3.json, and its classes vtkMRMLMarkupsPlaneNode and vtkMRMLMarkupsPlaneJsonStorageNode.
 """
 
@@ -21,7 +21,7 @@ from armscan.utils.validation import check_numbers
 
 # From the file's coordinates to LPS.
 TO_LPS = {"LPS": np.array([1.0, 1.0, 1.0]), "RAS": np.array([-1.0, -1.0, 1.0])}
-# As Slicer, its schema and other programs spell them, in lower case.
+# Spellings in Slicer, its schema and other programs, in lower case.
 PLANE_TYPES = {
     "pointnormal": "pointNormal",
     "threepoints": "threePoints",
@@ -29,7 +29,7 @@ PLANE_TYPES = {
     "planefit": "planeFit",
 }
 MAX_MM = 1e6
-# Two statements of one plane differ by no more than rounding in the file explains.
+# Two descriptions of one plane may differ by this much, because the file rounds.
 SAME_MM, SAME_DEG = 0.1, 0.1
 
 Plane = tuple[FloatArray, FloatArray]
@@ -40,8 +40,8 @@ class SlicerPlane:
     """A plane in the world, in LPS.
 
     Args:
-        point_mm: Point of the plane, in mm, shape (3,): the rectangle's middle if the file has a point and a normal.
-        normal: Unit normal, one of two, shape (3,).
+        point_mm: Point of the plane, in mm, shape (3,): the rectangle's centre if the file has a point and a normal.
+        normal: Unit normal, of either sign, shape (3,).
         size_mm: Width and height of the rectangle in mm; None if the file has no size.
     """
 
@@ -54,14 +54,14 @@ def read_slicer_plane(path: Path) -> SlicerPlane:
     """Read the one plane of a markups file.
 
     Raises:
-        MarkupError: Naming the file and the key, if the file cannot be read, holds no plane or several, is in other
-            units than mm, or does not say where the plane lies, or says so twice and differently.
+        MarkupError: Naming the file and the key, if the file cannot be read, holds no plane or several, is in units
+            other than mm, or does not define where the plane lies, or defines it twice and differently.
     """
     markup = _only_plane(_load(path), path)
     system, units = markup.get("coordinateSystem", "LPS"), markup.get("coordinateUnits", "mm")
     if not isinstance(system, str) or system not in TO_LPS:
         raise _error(path, "coordinateSystem", system, listed(TO_LPS))
-    # Either the unit, or its code with the coding scheme and a name.
+    # Either the unit, or a list of its code, coding scheme and name.
     if (units[0] if isinstance(units, list) and units else units) != "mm":
         raise _error(path, "coordinateUnits", units, "mm")
     point_mm, normal = _agreed(_shown(markup, path), _stated(markup, path), path)
@@ -95,7 +95,7 @@ def _only_plane(document: Any, path: Path) -> dict[str, Any]:
 
 def _shown(markup: dict[str, Any], path: Path) -> Plane | None:
     """Return the plane that Slicer shows; None if the file lacks the entries for it."""
-    # Files without a type are from before there were several.
+    # Files without a type predate the other types.
     kind = markup.get("planeType", "threePoints")
     if not isinstance(kind, str) or kind.lower() not in PLANE_TYPES:
         raise _error(path, "planeType", kind, listed(sorted(set(PLANE_TYPES.values()))))
@@ -104,7 +104,7 @@ def _shown(markup: dict[str, Any], path: Path) -> Plane | None:
     if kind == "pointNormal" and len(points) > 1:
         return points[0], _unit(points[1] - points[0], "controlPoints", path)
     if kind == "pointNormal" and len(points) == 1 and "baseToNode" in markup:
-        # Its columns are the plane's x axis, y axis and normal, and a place that Slicer overrides by the control point.
+        # Columns: the plane's x axis, y axis and normal, and a position, which Slicer replaces by the control point.
         base_to_node = _numbers(markup, "baseToNode", 16, path).reshape(4, 4)
         return points[0], _unit(base_to_node[:3, 2], "baseToNode", path)
     if kind != "pointNormal" and len(points) >= 3:
@@ -113,7 +113,7 @@ def _shown(markup: dict[str, Any], path: Path) -> Plane | None:
 
 
 def _stated(markup: dict[str, Any], path: Path) -> Plane | None:
-    """Return the plane by its centre and normal, None if the file has no such keys."""
+    """Return the plane given by `center` and `normal`; None if the file lacks either."""
     if "center" not in markup or "normal" not in markup:
         return None
     return _numbers(markup, "center", 3, path), _unit(_numbers(markup, "normal", 3, path), "normal", path)
@@ -148,7 +148,7 @@ def _control_points(markup: dict[str, Any], path: Path) -> FloatArray:
 
 
 def _fitted(points: FloatArray, path: Path) -> Plane:
-    """Return the plane with the least squared distance from points, shape (n, 3)."""
+    """Return the least-squares plane through points, shape (n, 3)."""
     middle = points.mean(axis=0)
     _, extents, directions = np.linalg.svd(points - middle)
     if extents[1] < 1e-6 * max(1.0, extents[0]):

@@ -1,4 +1,4 @@
-"""The compiled lookup of a slice: nearest voxel at each point of a plane, nothing else of the volume touched."""
+"""Compiled lookup of a slice: the nearest voxel at each point of a plane, without touching the rest of the volume."""
 
 from __future__ import annotations
 
@@ -11,27 +11,26 @@ from armscan.utils.arrays import FloatArray
 from armscan.utils.compilation import cached_njit
 from armscan.utils.prefetch import prefetch
 
-# Rows that are looked up together, after those voxels of the next ones are asked for; pixels between two of these.
+# Rows that are read together, after voxels of the next rows were prefetched; pixels from one prefetch to the next.
 N_ROWS, PREFETCH_STEP = 8, 8
-# Columns of voxels, along X and along Y, of a block of `occupied_depths`.
+# Columns of voxels along X, and along Y, in a block of `occupied_depths`.
 BLOCK = 8
 LARGEST_INT32 = 2**31 - 1
-# Of positions in mm, far above what their rounding is.
+# In mm, far above the rounding errors of positions.
 SMALLEST_CLEARANCE = 1e-12
 
 # First position of a row of pixels on an axis, in voxels, and the step from one pixel to the next.
 Line = tuple[float, float]
 Lines = tuple[Line, Line, Line]
-# Of an axis of the volume: how much of the way across it takes, the plane's origin and the spacing in mm, and the step.
+# For an axis of the volume: its part of the plane's X axis, the plane's origin and the spacing in mm, and the step.
 Axis = tuple[float, float, float, float]
 
 
 @cached_njit(nogil=True, error_model="numpy")
 def occupied_depths(labels_yxz: NDArray[np.uint8]) -> NDArray[np.int32]:
-    """Return the depths that a volume's labels occupy: the first, and that after the last, of each block of columns.
+    """Return the range of depths, first and after the last, that labels occupy in each block of 8 x 8 voxel columns.
 
-    Blocks have 8 x 8 columns of voxels; the result has the shape (ceil(nx / 8), ceil(ny / 8), 2). A block of background
-    has the depths nz and 0.
+    The result has the shape (ceil(nx / 8), ceil(ny / 8), 2). A block of background has the range (nz, 0).
     """
     n_y, n_x, n_z = labels_yxz.shape
     depths = np.empty((-(-n_x // BLOCK), -(-n_y // BLOCK), 2), dtype=np.int32)
@@ -63,9 +62,9 @@ def sample_plane(
     Pixel (i, k) is p = (i sx, 0, k sz) and takes the voxel floor(q / s + 0.5) of q = matrix p + offset, 0 outside.
 
     Args:
-        labels_yxz: Labels of the volume, shape (ny, nx, nz), C-contiguous: with Y first, so that a slice across the arm
-            lies in a small part of the memory.
-        occupied: Their `occupied_depths`: pixels beside them are 0, and not looked up.
+        labels_yxz: Labels of the volume, shape (ny, nx, nz), C-contiguous. Y comes first so that a slice across the arm
+            lies in a small part of memory.
+        occupied: `occupied_depths` of the labels; pixels outside them are 0, without a lookup.
         spacing_mm: Voxel spacing (sx, sy, sz) in mm.
         matrix: Rotation from the plane's frame into the volume's, shape (3, 3).
         offset_mm: Origin of the plane in the volume, in mm, shape (3,).
@@ -73,7 +72,7 @@ def sample_plane(
     """
     n_rows, n_depth = 2 * N_ROWS, slice_xz.shape[1]
     plane = occupied, spacing_mm, matrix, offset_mm
-    # Of places half as wide, twice as many are computed at a time.
+    # With indices half as wide, SIMD computes twice as many at a time.
     if labels_yxz.size <= LARGEST_INT32:
         _sample(labels_yxz, *plane, np.empty((n_rows, n_depth), dtype=np.int32), slice_xz)
     else:
@@ -86,7 +85,7 @@ def clearance(
     offset_mm: FloatArray,
     shape: tuple[int, int],
 ) -> float:
-    """Return how far each number of a plane's matrix and offset may be off without changing a voxel of its slice.
+    """Return how far each entry of a plane's matrix and offset may be off without changing a pixel of its slice.
 
     Args:
         spacing_mm: Voxel spacing (sx, sy, sz) in mm.
@@ -99,7 +98,7 @@ def clearance(
     for row, offset, step in zip(matrix, offset_mm, spacing_mm, strict=True):
         places = (row[0] * across_mm[:, None] + row[2] * depth_mm + offset) / step + 0.5
         nearest = min(nearest, float(np.abs(places - np.rint(places)).min()))
-    # Half of it, for rounding; where less is left than that is sure to be, nothing.
+    # Halved as a margin for rounding; 0 if what is left is too close to rounding errors.
     free: float = nearest * min(spacing_mm) / (across_mm[-1] + depth_mm[-1] + 1.0) / 2.0
     return free if free > SMALLEST_CLEARANCE else 0.0
 
@@ -114,7 +113,7 @@ def _sample(
     places: NDArray[Any],
     slice_xz: NDArray[np.uint8],
 ) -> None:
-    """As `sample_plane`; `places` is for the places, in the flat volume, of the voxels of the rows under way."""
+    """Do the work of `sample_plane`; `places` is a buffer for the flat voxel indices of the rows in progress."""
     s_x, s_y, s_z = spacing_mm
     axes = (
         _axis(0, matrix, offset_mm, s_x, s_z),
@@ -129,7 +128,7 @@ def _sample(
         pixels[pixel] = 0
     inside = np.empty((2 * N_ROWS, 2), dtype=np.int64)
     along = np.arange(n_depth).astype(np.float64)
-    # A slice lies scattered over the volume's memory: what it waits for is fetched while the next places are computed.
+    # A slice's voxels are scattered over memory: those of the next rows are prefetched before the last ones are read.
     for first in range(0, n_across + N_ROWS, N_ROWS):
         if first < n_across:
             ends = _lines(axes, first * s_x), _lines(axes, (min(first + N_ROWS, n_across) - 1) * s_x)
@@ -157,13 +156,13 @@ def _sample(
 
 @cached_njit(nogil=True, error_model="numpy")
 def _axis(axis: int, matrix: FloatArray, offset_mm: FloatArray, spacing_mm: float, s_z: float) -> Axis:
-    """Return what `_lines` requires of an axis with this spacing; steps of pixels in depth are `s_z` mm long."""
+    """Return what `_lines` needs of an axis with this spacing; pixels are `s_z` mm apart in depth."""
     return matrix[axis, 0], offset_mm[axis], spacing_mm, matrix[axis, 2] * s_z / spacing_mm
 
 
 @cached_njit(nogil=True, error_model="numpy")
 def _lines(axes: tuple[Axis, Axis, Axis], across_mm: float) -> Lines:
-    """Return the positions, on each axis, of the pixels of a row that begins so far across."""
+    """Return the line, on each axis, of the row of pixels that is `across_mm` across."""
     (m_x, b_x, s_x, step_x), (m_y, b_y, s_y, step_y), (m_z, b_z, s_z, step_z) = axes
     return (
         ((m_x * across_mm + b_x) / s_x + 0.5, step_x),
@@ -176,7 +175,7 @@ def _lines(axes: tuple[Axis, Axis, Axis], across_mm: float) -> Lines:
 def _within_occupied(
     ends: tuple[Lines, Lines], occupied: NDArray[np.int32], shape: tuple[int, int, int], n_depth: int
 ) -> tuple[int, int]:
-    """Return pixels (start, stop) beside which some rows show nothing; `ends` has the lines of the first and last."""
+    """Return pixels (start, stop) outside which a group of rows is empty; `ends` has its first and last lines."""
     lowest_x, highest_x = _blocks(ends[0][0], ends[1][0], shape[0], n_depth)
     lowest_y, highest_y = _blocks(ends[0][1], ends[1][1], shape[1], n_depth)
     lowest, highest = shape[2], 0
@@ -185,7 +184,7 @@ def _within_occupied(
             lowest, highest = min(lowest, occupied[x, y, 0]), max(highest, occupied[x, y, 1])
     if lowest >= highest:
         return 0, 0
-    # Rounding keeps an order, so that positions rise or fall from row to row, and the first and last tell of all.
+    # Rounding is monotonic: positions rise or fall from row to row, so the first and last row bound the others.
     start, stop = _within(ends[0][2], lowest, highest, 0, n_depth)
     start_last, stop_last = _within(ends[1][2], lowest, highest, 0, n_depth)
     return min(start, start_last), max(stop, stop_last)
@@ -193,7 +192,7 @@ def _within_occupied(
 
 @cached_njit(nogil=True, error_model="numpy")
 def _blocks(first: Line, last: Line, n_voxels: int, n_depth: int) -> tuple[int, int]:
-    """Return the range of blocks on an axis that pixels of rows from `first` to `last` lie in."""
+    """Return the range of blocks on an axis that the pixels of rows `first` to `last` lie in."""
     farthest = n_depth - 1
     lowest = min(min(first[0], first[0] + first[1] * farthest), min(last[0], last[0] + last[1] * farthest))
     highest = max(max(first[0], first[0] + first[1] * farthest), max(last[0], last[0] + last[1] * farthest))
@@ -204,7 +203,7 @@ def _blocks(first: Line, last: Line, n_voxels: int, n_depth: int) -> tuple[int, 
 
 @cached_njit(nogil=True, error_model="numpy")
 def _are_inside(ends: tuple[Lines, Lines], shape: tuple[int, int, int], start: int, stop: int) -> bool:
-    """Return whether the pixels from `start` to before `stop` of all rows lie in the volume, as those at the ends."""
+    """Return whether pixels [start, stop) of all rows lie in the volume: whether those at the ends do."""
     for lines in ends:
         for axis in range(3):
             first, step = lines[axis]
@@ -215,10 +214,10 @@ def _are_inside(ends: tuple[Lines, Lines], shape: tuple[int, int, int], start: i
 
 @cached_njit(nogil=True, error_model="numpy")
 def _find_places(lines: Lines, shape: tuple[int, int, int], along: FloatArray, places: NDArray[Any]) -> None:
-    """Fill the places of voxels, those of the pixels with the numbers `along` of a row."""
+    """Fill the flat voxel indices of a row's pixels, whose numbers are `along`."""
     (first_x, step_x), (first_y, step_y), (first_z, step_z) = lines
     n_x, n_z = float(shape[0]), float(shape[2])
-    # In floats, which hold such whole numbers exactly, because several of them are computed at a time.
+    # In floats, which hold these whole numbers exactly, so that SIMD computes several at a time.
     for k in range(places.size):
         x, y = np.floor(first_x + step_x * along[k]), np.floor(first_y + step_y * along[k])
         places[k] = (y * n_x + x) * n_z + np.floor(first_z + step_z * along[k])
@@ -226,17 +225,17 @@ def _find_places(lines: Lines, shape: tuple[int, int, int], along: FloatArray, p
 
 @cached_njit(nogil=True, error_model="numpy")
 def _read(voxels: NDArray[np.uint8], places: NDArray[Any], row: NDArray[np.uint8]) -> None:
-    """Fill a part of a row of a slice."""
+    """Fill part of a slice's row."""
     for k in range(places.size):
-        # An index without a sign is not looked at for being negative.
+        # An unsigned index needs no check for negative values.
         row[k] = voxels[np.uint64(places[k])]
 
 
 @cached_njit(nogil=True, error_model="numpy")
 def _within(line: Line, lowest: int, highest: int, start: int, stop: int) -> tuple[int, int]:
-    """Return which of the pixels from `start` to before `stop` lie in voxels from `lowest` to before `highest`."""
+    """Return the range of pixels within [start, stop) that lie in voxels [lowest, highest)."""
     first, step = line
-    # Rounding keeps an order, so that positions rise or fall all along a row, and its ends tell of all of it.
+    # Rounding is monotonic: positions rise or fall along a row, so its ends bound the rest.
     if lowest <= first + step * start < highest and lowest <= first + step * (stop - 1) < highest:
         return start, stop
     enters, leaves = (float(lowest), float(highest)) if step >= 0.0 else (float(highest), float(lowest))
@@ -246,7 +245,7 @@ def _within(line: Line, lowest: int, highest: int, start: int, stop: int) -> tup
 
 @cached_njit(nogil=True, error_model="numpy")
 def _first_beyond(line: Line, limit: float, start: int, stop: int) -> int:
-    """Return the first pixel that has passed a limit, from which on positions are at least it; `stop` if none has."""
+    """Return the first pixel past a limit: at or above it if positions rise, below it if they fall; else `stop`."""
     first, step = line
     while start < stop:
         middle = (start + stop) // 2

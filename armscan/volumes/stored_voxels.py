@@ -1,8 +1,8 @@
-"""The voxels of an image file as they are stored: as many as the header promises, and whole.
+"""Check that an image file stores exactly the voxels that its header declares, undamaged.
 
-SimpleITK makes room for what a header promises before it looks at the file, and checks neither the sums nor the ends of
-compressed voxels. Here nothing is read of a file that cannot hold what it promises, compressed voxels are inflated a
-piece at a time, which checks their sum, and no further than promised.
+SimpleITK allocates the declared size before it looks at the file, and verifies neither checksum nor end of compressed
+voxels. Here a file too small for its declared size is refused unread; compressed voxels are inflated in chunks, which
+verifies their checksum, and never beyond the declared size.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ import numpy as np
 from armscan.errors import VolumeError
 
 PIECE_BYTES = 1 << 20
-# No stream of deflate is inflated to more of its size.
+# The highest compression ratio of deflate.
 MAX_RATIO = 1032
-# What zlib calls its formats; MetaImages are read from either; their header does not say which.
+# `wbits` of zlib for each format; a MetaImage's header does not say which of the two it uses.
 GZIP, GZIP_OR_ZLIB = 31, 47
 
 
@@ -35,7 +35,7 @@ class StoredVoxels:
         offset: Number of bytes in the file before the voxels, or before their compressed stream.
         compression: `GZIP` or `GZIP_OR_ZLIB`; None if the voxels are not compressed.
         n_before: Number of uncompressed bytes between the offset and the first voxel.
-        finite: Data type of the voxels, such as '<f4', to check for NaN and infinity; None for no check.
+        finite: Data type of the voxels, such as '<f4', to check them for NaN and infinity; None: no check.
     """
 
     file: Path
@@ -47,7 +47,7 @@ class StoredVoxels:
 
 
 def check_stored(path: Path, stored: StoredVoxels) -> None:
-    """Raise `VolumeError`, naming the image `path`, unless the voxels are as many as promised, and whole."""
+    """Raise `VolumeError`, naming the image `path`, unless the file stores exactly the declared voxels, undamaged."""
     n_stored = stored.file.stat().st_size - stored.offset
     if stored.compression is None:
         _check_length(path, n_stored, stored.n_bytes)
@@ -76,10 +76,10 @@ def check_stored(path: Path, stored: StoredVoxels) -> None:
 
 
 def pieces(path: Path, file: BinaryIO, compression: int | None) -> Iterator[bytes]:
-    """Yield the rest of a file piece by piece, inflated if it is compressed.
+    """Yield the rest of a file in chunks, inflated if it is compressed.
 
     Raises:
-        VolumeError: Naming the image `path`, where what is compressed is damaged or ends too early.
+        VolumeError: Naming the image `path`, if the compressed data is damaged or truncated.
     """
     if compression is None:
         yield from iter(lambda: file.read(PIECE_BYTES), b"")
@@ -90,7 +90,7 @@ def pieces(path: Path, file: BinaryIO, compression: int | None) -> Iterator[byte
             yield inflater.decompress(stored, PIECE_BYTES)
             stored = inflater.unconsumed_tail or inflater.unused_data or file.read(PIECE_BYTES)
             if inflater.eof and stored:
-                # Some programs write several streams, one after the other.
+                # Some programs write several concatenated streams.
                 inflater = zlib.decompressobj(compression)
     except zlib.error as error:
         raise VolumeError(f"{path}: the file is truncated or damaged ({error})") from error
@@ -115,7 +115,7 @@ def count_voxels(path: Path, sizes: Sequence[int]) -> int:
 
 
 def check_spacing(path: Path, spacing: Sequence[float]) -> None:
-    """Raise `VolumeError` unless each step, in mm, is finite and above 0."""
+    """Raise `VolumeError` unless the spacing along each axis, in mm, is finite and above 0."""
     if not all(math.isfinite(step) and step > 0 for step in spacing):
         received = ", ".join(f"{step:g}" for step in spacing)
         raise VolumeError(f"{path}: the spacing in the file is ({received}) mm, but each must be finite and above 0")

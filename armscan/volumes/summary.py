@@ -13,14 +13,14 @@ from armscan.volumes.volume import LabelVolume
 
 @dataclass(frozen=True, kw_only=True)
 class StoredFile:
-    """The file of a volume.
+    """Metadata of a volume's file.
 
     Args:
         shape: Number of voxels along the file's own axes.
         spacing: Voxel spacing along the file's own axes, in mm.
         orientation: Directions that the file's axes run towards, such as 'LPS'.
         found: Every value or segment, its label and the number of its voxels in the file.
-        missing: Values and segments of the label map that the file does not hold.
+        missing: Values and segments of the label map that the file does not contain.
         crop_mm: Part of the volume that is kept, in mm; None for all.
     """
 
@@ -33,7 +33,7 @@ class StoredFile:
 
     @property
     def ignored(self) -> tuple[Source, ...]:
-        """Values and segments of the file that became background, without the value 0."""
+        """Values and segments of the file, except 0, that became background."""
         return tuple(each.source for each in self.found if each.label == BACKGROUND and each.source != 0)
 
 
@@ -62,7 +62,7 @@ class VolumeReport:
 
 
 def missing_sources(labels: LabelMap | None, found: tuple[Found, ...]) -> tuple[Source, ...]:
-    """Return the entries of the label map that the file lacks: values of a plain file, names of a segmentation."""
+    """Return the entries of the label map that the file lacks: values for a plain file, names for a segmentation."""
     if labels is None:
         return ()
     there = {each.source for each in found if each.n_voxels}

@@ -19,9 +19,9 @@ from armscan.volumes.rigid_transform import RigidTransform
 from armscan.volumes.slicing import clearance, occupied_depths, sample_plane
 
 LONGEST_SIDE_PX = 65536
-# Far beyond what any image has; the ratio of two spacings still is a number that a slice can be looked up with.
+# Far beyond any image, yet slices can still be computed with the ratio of two spacings.
 SMALLEST_SPACING_MM, MAX_SPACING_MM = 1e-6, 1e6
-# Of scalar products of unit vectors; files keep them with six digits or more.
+# For dot products of direction cosines; files store these with six digits or more.
 RIGHT_ANGLE_TOLERANCE = 1e-3
 
 
@@ -29,21 +29,21 @@ RIGHT_ANGLE_TOLERANCE = 1e-3
 class LabelVolume:
     """An integer labelmap of an arm with its spacing and, if one is known, the plane to find.
 
-    It may be one voxel thick along an axis; a plane beside it shows background, as beside any volume.
+    It may be one voxel thick along an axis. A plane outside the volume shows background.
 
     Args:
         labels: Integers over (x, y, z), shape (nx, ny, nz): X across the palm, Y along the arm, Z through the depth; 0
-            background, 1 bones, 2 flexor tendons, 3 ulnar artery, 4 median nerve. Kept as uint8, in memory with Y
-            first (`labels_yxz`).
+            background, 1 bones, 2 flexor tendons, 3 ulnar artery, 4 median nerve. Stored as uint8, with Y first in
+            memory (`labels_yxz`).
         spacing: Voxel spacing (sx, sy, sz) in mm.
         name: Name of the volume in errors, `info` and tables.
         optimal_action: Labelled plane, in the volume's own frame.
-        origin: World coordinates of voxel (0, 0, 0) in mm, to return to the world.
-        direction: Directions of the array's axes in the world, as columns (direction cosines), shape (3, 3).
+        origin: World coordinates (LPS) of voxel (0, 0, 0), in mm. Default: zeros.
+        direction: Direction cosines of the array's axes in the world, as columns, shape (3, 3). Default: the identity.
 
     Raises:
         VolumeError: Naming the volume, if the labels are not a 3-D array of the labels above, a landmark is missing,
-            the spacing is not finite and positive, or the way back is not a position and axes at right angles.
+            the spacing is not within 1e-6 to 1e6 mm, `origin` is not a position, or `direction` is not orthonormal.
     """
 
     labels: NDArray[np.uint8]
@@ -71,7 +71,7 @@ class LabelVolume:
 
     @classmethod
     def from_checked(cls, labels: NDArray[np.uint8], *, direction: FloatArray, fingerprint: str, **rest: Any) -> Self:
-        """Return a volume with the checked labels of an earlier one, which are not copied.
+        """Return a volume with the labels of an earlier one, which are neither checked nor copied.
 
         Args:
             labels: `labels` of the earlier volume.
@@ -85,8 +85,7 @@ class LabelVolume:
         return volume
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        # A copy, or one in another process, is as constant as this one, and lies in memory alike: arrays forget that on
-        # their way.
+        # Pickling loses the arrays' memory order and their read-only flags: restore both.
         state["labels"] = np.ascontiguousarray(state["labels"].transpose(1, 0, 2)).transpose(1, 0, 2)
         for array in (state["labels"], state["direction"]):
             array.flags.writeable = False
@@ -96,7 +95,7 @@ class LabelVolume:
         return self
 
     def __deepcopy__(self, _: dict[int, object]) -> Self:
-        """Return this volume: volumes are constant and large, and Gymnasium copies arguments deeply."""
+        """Return this volume: volumes are immutable and large, and Gymnasium deep-copies arguments."""
         return self
 
     def __repr__(self) -> str:
@@ -111,7 +110,7 @@ class LabelVolume:
 
     @property
     def size_mm(self) -> tuple[float, float, float]:
-        """Physical size n * s along each axis."""
+        """Physical size n * s along each axis, in mm."""
         n_x, n_y, n_z = (n * s for n, s in zip(self.shape, self.spacing, strict=True))
         return n_x, n_y, n_z
 
@@ -122,7 +121,7 @@ class LabelVolume:
 
     @cached_property
     def fingerprint(self) -> str:
-        """The SHA-256 of all that an agent can notice of the volume: voxels, spacing and labelled plane."""
+        """The SHA-256 of everything in the volume that affects an agent: voxels, spacing and labelled plane."""
         plane = self.optimal_action
         rest = (self.shape, self.spacing, None if plane is None else plane.to_array().tolist())
         digest = hashlib.sha256(repr(rest).encode())
@@ -131,18 +130,18 @@ class LabelVolume:
 
     @cached_property
     def centre_mm(self) -> tuple[float, float, float]:
-        """The middle between the first and the last voxel's centres."""
+        """The midpoint between the centres of the first and the last voxel, in mm."""
         c_x, c_y, c_z = ((n - 1) * s / 2 for n, s in zip(self.shape, self.spacing, strict=True))
         return c_x, c_y, c_z
 
     @cached_property
     def slice_shape(self) -> tuple[int, int]:
-        """Shape of a slice if none is asked for: (nx, nz)."""
+        """Default shape of a slice: (nx, nz)."""
         return self.shape[0], self.shape[2]
 
     @cached_property
     def pixel_mm(self) -> tuple[float, float]:
-        """Size of a slice's pixel: (sx, sz)."""
+        """Pixel size of a slice: (sx, sz) in mm."""
         return self.spacing[0], self.spacing[2]
 
     @cached_property
@@ -152,7 +151,7 @@ class LabelVolume:
 
     @cached_property
     def labelled_clearance(self) -> float:
-        """Allowed error of the labelled plane's matrix and offset that leaves its slice unchanged; see `clearance`."""
+        """Largest error in the labelled plane's matrix and offset that leaves its slice unchanged; see `clearance`."""
         plane = self.optimal_action
         assert plane is not None
         return clearance(self.spacing, plane.matrix, plane.offset_mm, self.slice_shape)
@@ -169,13 +168,13 @@ class LabelVolume:
         Args:
             action: Plane to slice.
             shape: Number of pixels (across, depth). None: (nx, nz).
-            transform: Motion of the volume, which slices V'(q) = V(T(q)). None: the volume as it is.
+            transform: Motion T of the volume: the slice is taken from V'(q) = V(T(q)). None: no motion.
 
         Returns:
             The slice, indexed [across, depth], uint8; 0 if the plane is outside the volume.
 
         Raises:
-            InvalidValueError: If `shape` is not two whole numbers from 1 to 65536, or another argument of another type.
+            InvalidValueError: If `shape` is not two whole numbers from 1 to 65536, or an argument has the wrong type.
         """
         if not isinstance(action, ManipulatorAction):
             raise InvalidValueError(f"action is {action!r}, but it must be a ManipulatorAction")
@@ -206,7 +205,7 @@ def _checked_labels(labels: NDArray[np.generic], name: str) -> NDArray[np.uint8]
     whole = check_whole(labels, name)
     if whole.min() < 0 or whole.max() > max(LABEL_NAMES):
         raise VolumeError(f"{name}: holds the values {shown(np.unique(whole).tolist())}, but {ALLOWED_LABELS} only")
-    # A copy: what the caller does with the array afterwards must not change the volume.
+    # A copy, so that later changes to the caller's array do not change the volume.
     checked = np.array(whole.transpose(1, 0, 2), dtype=np.uint8, order="C").transpose(1, 0, 2)
     for label in LANDMARK_LABELS:
         if not (checked == label).any():
@@ -239,7 +238,7 @@ def _checked_direction(direction: FloatArray, name: str) -> FloatArray:
         checked: FloatArray = np.array(direction, dtype=np.float64)
     except (TypeError, ValueError):
         checked = np.empty(0)
-    # Written so that a NaN fails it, too.
+    # Written so that NaN fails it, too.
     if checked.shape != (3, 3) or not (np.abs(checked.T @ checked - np.eye(3)) < RIGHT_ANGLE_TOLERANCE).all():
         received = np.array2string(checked, separator=", ").replace("\n", "") if checked.size else repr(direction)
         raise VolumeError(f"{name}: direction is {received}, but its 3 columns must be unit vectors at right angles")

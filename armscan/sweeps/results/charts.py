@@ -77,12 +77,12 @@ def _value(number: int) -> Callable[[FrozenTrial], float]:
 
 
 def _axis(metric: str) -> dict[str, Any]:
-    """Return how the axis of a metric is drawn."""
+    """Return the layout of a metric's axis."""
     return {"title": title_of(metric)} | (RATE_AXIS if is_rate(metric) else {})
 
 
 def _hover(trials: Sequence[FrozenTrial]) -> dict[str, Any]:
-    """Return what points of trials show under the mouse: value, number and settings."""
+    """Return the hover text of trials: value, number and settings."""
     said = [
         "<br>".join(map(html.escape, (f"trial {trial.number}", *overrides_of(searched_values(trial)))))
         for trial in trials
@@ -91,7 +91,7 @@ def _hover(trials: Sequence[FrozenTrial]) -> dict[str, Any]:
 
 
 def _history(trials: Sequence[FrozenTrial], number: int, objective: str, direction: StudyDirection) -> Figure:
-    """Return the values of the trials in their order, and the best so far of those that keep all constraints."""
+    """Return the values of the trials in order, and the best so far among feasible ones."""
     figure = Figure()
     for name, color, is_drawn in (("trial", BLUE, is_feasible), ("infeasible trial", GREY, _is_infeasible)):
         drawn = list(filter(is_drawn, trials))
@@ -141,7 +141,7 @@ def _slice(trials: Sequence[FrozenTrial], key: str, number: int, objective: str)
 
 
 def key_axis(key: str, distribution: BaseDistribution) -> dict[str, Any]:
-    """Return how the axis of a searched key is drawn: its whole range, or all of its choices."""
+    """Return the layout of a searched key's axis: its whole range, or all of its choices."""
     if isinstance(distribution, CategoricalDistribution):
         choices = list(map(str, distribution.choices))
         return {"title": key, "type": "category", "categoryorder": "array", "categoryarray": choices}
@@ -154,7 +154,7 @@ def key_axis(key: str, distribution: BaseDistribution) -> dict[str, Any]:
 
 
 def _reports(trials: Sequence[FrozenTrial], number: int, objective: str) -> Figure:
-    """Return a chart of the trials' reports: finished trials in grey, pruned ones to a cross, and running ones."""
+    """Return a chart of the trials' reports: finished trials grey, pruned ones ending in a cross, running ones blue."""
     figure, named = Figure(), set()
     looks: dict[TrialState, tuple[str, dict[str, Any]]] = {
         TrialState.COMPLETE: ("finished", {"line": {"color": GREY, "width": 1}, "opacity": 0.6}),

@@ -72,7 +72,7 @@ def _print_best(opened: OpenedStudy) -> None:
 
 
 def _print_replay(opened: OpenedStudy) -> None:
-    """Print the command that trains the best member of a population again, with its whole schedule."""
+    """Print the commands that retrain the best member of a population with its whole schedule, one for each seed."""
     search = opened.search
     if search.population is not None and (best := best_trials(search.scheduler.study, 1)):
         for seed in opened.settings.seeds:

@@ -48,7 +48,7 @@ def all_numbers(
     """Return the tables by the names of their files.
 
     Args:
-        study: Study in its storage.
+        study: The study in its storage.
         trials: Its trials.
         found: Results on the test volumes; empty without a final evaluation.
         candidates: Candidates of the selection; empty without one.
@@ -103,7 +103,7 @@ def _trial_row(trial: FrozenTrial, objectives: Sequence[str]) -> Row:
 
 
 def _ending_rows(trials: Sequence[FrozenTrial]) -> list[Row]:
-    """Return how many trials have ended in each way, and for which cause."""
+    """Return the number of trials that ended in each state, by cause."""
     of_ending: dict[tuple[str, str], list[int]] = {}
     for trial in trials:
         cause = ""
@@ -132,7 +132,7 @@ def _difference_rows(judgement: Judgement) -> Iterator[Row]:
 
 
 def _result_rows(found: Sequence[ConfigResult]) -> Iterator[Row]:
-    """Yield every figure of the result, also those of the baselines."""
+    """Yield every metric of the result, including those of the baselines."""
     for result in found:
         for of, figures in {"agent": result.figures, **result.baselines}.items():
             for name, (value, low, high) in figures.estimates.items():
@@ -141,16 +141,16 @@ def _result_rows(found: Sequence[ConfigResult]) -> Iterator[Row]:
 
 
 def _importance_rows(study: optuna.Study, objectives: Sequence[str]) -> list[Row]:
-    """Return which share of the differences between trials each key explains; none where too few have finished."""
+    """Return the share of the differences between trials that each key explains; empty if too few have finished."""
     # PED-ANOVA: Watanabe et al. 2023, arXiv:2304.10255.
     rows: list[Row] = []
     if len(study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))) < MIN_TRIALS_FOR_IMPORTANCE:
         return rows
-    # Low is good for the evaluator.
+    # The evaluator assumes that lower is better.
     for number, (objective, sign) in enumerate(zip(objectives, loss_signs(study.directions).tolist(), strict=True)):
         target = _value(number, sign) if len(objectives) > 1 else None
         with warnings.catch_warnings():
-            # That low is good.
+            # It warns that it assumes so.
             warnings.simplefilter("ignore")
             shares = get_param_importances(study, evaluator=PedAnovaImportanceEvaluator(), target=target)
         rows += [{"objective": objective, "key": key, "importance": share} for key, share in shares.items()]

@@ -1,4 +1,4 @@
-"""The result of a study: the chosen configuration beside the control, on the test volumes, seed by seed."""
+"""The result of a study: the chosen configuration compared with the control on the test volumes, seed by seed."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Difference(NamedTuple):
     Args:
         metric: Name of the metric.
         is_higher_better: Whether higher values are better.
-        paired: Mean over the seeds and volumes of the chosen one's value less the control's, with its 95 % interval.
+        paired: Mean difference (chosen minus control) over the seeds and volumes, with its 95 % interval.
         probability: Probability that a training of the chosen one is better on a volume than one of the control.
     """
 
@@ -60,19 +60,19 @@ class Difference(NamedTuple):
 
     @property
     def is_alike(self) -> bool:
-        """Whether all differences are alike, but for rounding: then there is no interval."""
+        """Whether all differences are equal up to rounding: then there is no interval."""
         return math.isclose(self.paired.low, self.paired.high, rel_tol=1e-9, abs_tol=1e-12)
 
     @property
     def verdict(self) -> str:
-        """Return `better` or `worse`, as the interval says; empty if it includes 0, or there is none."""
+        """Return `better` or `worse` according to the interval; empty if it includes 0, or there is none."""
         above, below = ("better", "worse") if self.is_higher_better else ("worse", "better")
         if self.is_alike:
             return ""
         return above if self.paired.low > 0 else below if self.paired.high < 0 else ""
 
     def row(self) -> dict[str, str]:
-        """Return its cells in a table, by column."""
+        """Return its row of a table: cells by column."""
         unit = " points" if is_rate(self.metric) else ""
         sizes = (value_text(self.metric, abs(each)).removesuffix("%") for each in self.paired)
         value, low, high = (f"{'-' if each < 0 else '+'}{size}" for each, size in zip(self.paired, sizes, strict=True))
@@ -98,14 +98,13 @@ class Judgement:
     """Judgement of the chosen configuration on the test volumes.
 
     Args:
-        chosen: The configuration: the number of a trial, or that of the control.
+        chosen: Number of the chosen trial, or `CONTROL`.
         results: Results of the chosen one and the control, as far as their trainings have finished.
         differences: Differences of the objectives and of the leading metrics; none where the control was chosen.
         n_seeds: Number of seeds that both have been trained with.
-        n_planned: Number of seeds that they are to be trained with.
-        others: Other trials that the test volumes have been opened for, because the study continued after its end.
-        settings: The settings of the chosen one and the control, as words of the command line, by their names; empty
-            without any.
+        n_planned: Number of seeds planned for both.
+        others: Other trials evaluated on the test volumes, because the study continued after its end.
+        settings: Overrides of the chosen one and the control, by their names; an empty string without any.
     """
 
     chosen: int
@@ -128,7 +127,7 @@ class Judgement:
 
     @property
     def compared(self) -> str:
-        """The configurations that the differences are between, and their seeds."""
+        """The compared configurations and their seeds."""
         seeds = f"{self.n_seeds} new seed{'s' if self.n_seeds > 1 else ''}"
         return f"{name_of(self.chosen).capitalize()} and the control, both with the same {seeds}"
 
@@ -233,12 +232,12 @@ def result_note(judgement: Judgement | None) -> str:
 def _differences(
     search: optuna.Study, chosen: Sequence[FrozenTrial], control: Sequence[FrozenTrial]
 ) -> Iterator[Difference]:
-    """Yield the differences of the metrics that all trainings have; both have the same seeds, in order."""
+    """Yield the differences of the metrics that all trainings have; both have the same seeds in the same order."""
     metrics = [trial.user_attrs[METRICS] for trial in (*chosen, *control)]
     common = set.intersection(*map(set, metrics))
     tested = [name for name in metrics_of_test(metrics[0]) if TEST_PREFIX + name in common]
     objectives = search.user_attrs[OBJECTIVES]
-    # First what the configuration was selected by.
+    # First the objectives, by which the configuration was selected.
     for name in dict.fromkeys((*(name for name in objectives if name in tested), *leading_among(tested))):
         scores = scores_of(TEST_PREFIX + name, metrics)
         if not np.isfinite(scores).all():

@@ -1,4 +1,4 @@
-"""Progress of a study: one live table on a terminal, a line a trial elsewhere."""
+"""Progress of a study: a live table on a terminal, one line per trial elsewhere."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ REFRESH_S = 2.0
 
 @contextmanager
 def progress_display(opened: OpenedStudy, folder: Path) -> Iterator[None]:
-    """Show the progress of a study inside the context, from its storage.
+    """Show the progress of a study inside the context, read from its storage.
 
     Args:
         opened: Study to show.
@@ -49,12 +49,12 @@ def progress_display(opened: OpenedStudy, folder: Path) -> Iterator[None]:
                 print_sentence(printable(_describe(trial, phase)))
 
     def show() -> None:
-        # A display is not worth waiting for, and a retry would delay the exit.
+        # A display need not wait for the storage, and a retry would delay the exit.
         with no_retry():
             if not sys.stdout.isatty():
                 repeat(print_new, stopped)
                 return
-            # The end is told below it.
+            # Transient: the result is printed in its place.
             with Live(refresh_per_second=1, transient=True) as live:
                 repeat(lambda: live.update(_table(opened)), stopped)
 
@@ -71,11 +71,11 @@ def progress_display(opened: OpenedStudy, folder: Path) -> Iterator[None]:
 
 
 def repeat(show: Callable[[], None], stopped: threading.Event) -> None:
-    """Show a study's progress again and again; if its storage is unreachable or damaged, say so.
+    """Show a study's progress repeatedly; print an error if its storage is unavailable or damaged.
 
     Args:
         show: Function that shows it once.
-        stopped: Event that ends the repetition, after it is shown a last time.
+        stopped: Event that ends the loop, after a last update.
     """
     told, is_last = "", False
     while not is_last:
@@ -99,7 +99,7 @@ def _ended(opened: OpenedStudy) -> list[tuple[tuple[str, int], FrozenTrial, Phas
 
 
 def _table(opened: OpenedStudy) -> Table:
-    """Return a table of the running trials, below the state of the study."""
+    """Return a table of the running trials, with the state of the study as its title."""
     state = opened.search.scheduler.state()
     finals = [(phase, phase.scheduler.state()) for phase in opened.finals]
     # As wide as the terminal.

@@ -1,4 +1,4 @@
-"""The report of a study: one HTML file that needs no server, and every number of it as CSV beside it."""
+"""The report of a study: one HTML file that needs no server, and all of its numbers as CSV files beside it."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from armscan.sweeps.study.study import best_trials
 from armscan.training.metric_display import title_of, value_text
 from armscan.utils.files import ID_CHARS
 
-# How people say the states of trials.
+# Names of trial states for users.
 STATES = {"complete": "finished", "fail": "failed"}
-# How a GIF begins.
+# First bytes of a GIF.
 GIF = b"GIF8"
 
 
@@ -43,11 +43,11 @@ def write_report(
     """Write the report of a study.
 
     Args:
-        study: Study in its storage.
-        final_trials: Trials on the test volumes; empty without one.
+        study: The study in its storage.
+        final_trials: Trials on the test volumes; empty without a final evaluation.
         folder: Folder that takes `report.html` and the CSV files.
         final: Final evaluation of the study. Default: None, there is none, or an earlier version made it.
-        refresh_s: Seconds after which a browser reads the page again. Default: None, never.
+        refresh_s: Seconds after which a browser reloads the page. Default: None, never.
 
     Returns:
         The HTML file.
@@ -57,7 +57,7 @@ def write_report(
     state = StudyState.of(trials)
     judgement = judge(final) if final is not None else None
     candidates = candidates_of(final) if final is not None else []
-    # Of an earlier version: its best configurations, without a control.
+    # An earlier version evaluated its best configurations, without a control.
     found = final_results(final_trials) if final is None else judgement.results if judgement is not None else ()
     tables = all_numbers(study, trials, found, candidates, judgement)
     parts = [
@@ -102,7 +102,7 @@ def _summary(study: optuna.Study, state: StudyState, best: Sequence[FrozenTrial]
 
 
 def _running(running: Sequence[FrozenTrial]) -> str:
-    """Return a table of the running trials, nothing if there are none."""
+    """Return a table of the running trials; an empty string if there are none."""
     rows = [
         {
             "trial": trial.number,
@@ -118,7 +118,7 @@ def _running(running: Sequence[FrozenTrial]) -> str:
 
 
 def _settings(trial: FrozenTrial) -> Row:
-    """Return the values of a trial by their keys, rounded by the table."""
+    """Return the values of a trial by key; the table rounds them."""
     return _plain(trial.params)
 
 
@@ -127,7 +127,7 @@ def _plain(settings: Mapping[str, Any]) -> Row:
 
 
 def _trials(trials: Sequence[FrozenTrial], objectives: Sequence[str]) -> str:
-    """Return a table of all trials, the best by the first objective first."""
+    """Return a table of all trials, in the order of their numbers."""
     rows = []
     for trial in trials:
         is_complete = trial.state == TrialState.COMPLETE
@@ -147,7 +147,7 @@ def _trials(trials: Sequence[FrozenTrial], objectives: Sequence[str]) -> str:
 
 
 def _ended(trial: FrozenTrial) -> str:
-    """Return how a trial has ended, whether it violates a constraint, and where it was run if elsewhere."""
+    """Return how a trial has ended, whether it violates a constraint, and which study it was taken from, if any."""
     infeasible = "" if is_feasible(trial) else ", infeasible"
     elsewhere = f", in {trial.user_attrs[TAKEN_FROM]}" if TAKEN_FROM in trial.user_attrs else ""
     return f"{_said(trial.state.name.lower())}{infeasible}{elsewhere}"
@@ -164,7 +164,7 @@ def _said(state: str) -> str:
 
 
 def _videos(final_trials: Sequence[FrozenTrial]) -> str:
-    """Return a video of each finally evaluated configuration, of its first training that has one here."""
+    """Return one video of each configuration on the test volumes, from its first training with a video here."""
     videos: dict[int, str] = {}
     for trial in final_trials:
         files = sorted(Path(trial.user_attrs.get(FOLDER, "nowhere")).glob("seed_*/episode.gif"))

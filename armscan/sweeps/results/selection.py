@@ -27,7 +27,7 @@ class Candidate(NamedTuple):
     """A candidate of the selection.
 
     Args:
-        number: Number of its trial, or that of the control.
+        number: Number of its trial, or `CONTROL`.
         scores: The objective on the validation volumes by seed, NaN for a training that failed.
         estimate: Its mean with the 95 % interval by which candidates are compared.
         n_seeds: Number of seeds that the estimate is over.
@@ -48,7 +48,7 @@ class Candidate(NamedTuple):
         return name_of(self.number)
 
     def row(self, objective: str) -> dict[str, str]:
-        """Return its cells in a table, by column."""
+        """Return its row of a table: cells by column."""
         value, low, high = (value_text(objective, each) for each in self.estimate)
         is_known = math.isfinite(self.estimate.value)
         return {
@@ -66,7 +66,7 @@ def objective_of(final: FinalEvaluation) -> str:
 
 
 def candidates_of(final: FinalEvaluation) -> list[Candidate]:
-    """Return the candidates, the chosen one first, then the others, most seeds first."""
+    """Return the candidates, the chosen one first, then those with the most seeds."""
     scores_of, sign = final.scores(), final.sign
     race = final.race(scores_of)
     searched = final.search.get_trials(deepcopy=False)
@@ -97,7 +97,7 @@ def _outcome(race: Race, number: int) -> str:
 
 
 def selection_chart(candidates: Sequence[Candidate], objective: str) -> Figure:
-    """Return the candidates with their intervals, and a dot for each seed."""
+    """Return a chart of the candidates with their intervals, and a dot for each seed."""
     figure = Figure()
     labels = [f"{each.name}, {each.outcome}" for each in candidates]
     for each, label in zip(candidates, labels, strict=True):
@@ -138,7 +138,7 @@ def score_rows(candidates: Sequence[Candidate]) -> Iterator[dict[str, Any]]:
 def decision_section(
     final: FinalEvaluation, judgement: Judgement | None, candidates: Sequence[Candidate], searched: StudyState
 ) -> str:
-    """Return how a study has decided, step by step, as HTML."""
+    """Return an explanation in HTML, step by step, of how a study decided."""
     objective, settings = objective_of(final), final.settings
     better = "higher" if final.sign > 0 else "lower"
     n_selected = sum(len(each.scores) for each in candidates)

@@ -1,4 +1,4 @@
-"""Results of a study's final trainings on the test volumes, over seeds that did not choose them."""
+"""Results of a study's final trainings on the test volumes, with seeds that had no part in the selection."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class ConfigResult:
     """Final evaluation of one configuration.
 
     Args:
-        number: Number of the trial that found the configuration.
+        number: Number of the trial that found the configuration, or `CONTROL`.
         figures: Metrics over all final trainings, with their intervals.
         baselines: Metrics of the baselines on the same volumes, by their names.
     """
@@ -51,7 +51,7 @@ def values_of(trial: FrozenTrial, objectives: Iterable[str]) -> str:
 
 
 def final_table(results: Sequence[ConfigResult]) -> ResultTable:
-    """Return the table of a study's result, a line for each configuration and for each baseline."""
+    """Return the table of a study's result, with a row for each configuration and each baseline."""
     figures = {name_of(result.number): result.figures for result in results}
     return ResultTable(with_baselines(figures, {name_of(each.number): each.baselines for each in results}))
 
@@ -59,8 +59,8 @@ def final_table(results: Sequence[ConfigResult]) -> ResultTable:
 def final_results(trials: Sequence[FrozenTrial]) -> list[ConfigResult]:
     """Return the final evaluation of each configuration, over all episodes of all its trainings.
 
-    The intervals draw seeds, each with all its volumes, because one training was evaluated on all of them. Older trials
-    stored no episodes; their intervals come from the means of seeds and volumes.
+    The intervals resample seeds, each with all its volumes, because one training was evaluated on all of them. Older
+    trials stored no episodes; their intervals come from the means of seeds and volumes.
 
     Args:
         trials: Trials of the final evaluation; unfinished ones are left out.
@@ -78,7 +78,7 @@ def _config_result(number: int, of_seeds: Sequence[FrozenTrial]) -> ConfigResult
         return ConfigResult(number, _of_means([trial.user_attrs[METRICS] for trial in of_seeds]), {})
     seeds = [trial.user_attrs[FINAL_SEED] for trial in of_seeds]
     figures = MetricEstimates.of_trainings(dict(zip(seeds, (each[TEST] for each in kept), strict=True)))
-    # The baselines have no part in the training: each seed has met the same.
+    # Baselines do not depend on the training: they are the same for each seed.
     baselines = {name: MetricEstimates.of(each) for name, each in kept[0].items() if name != TEST}
     return ConfigResult(number, beside_random(figures, [each[TEST] for each in kept], kept[0].get(RANDOM)), baselines)
 

@@ -2,7 +2,7 @@
 
 A trial trains one member for one generation, an interval of environment steps, from the last checkpoint of its parent.
 Members never wait for each other (asynchronous, as in Jaderberg et al. 2017, arXiv:1711.09846). Everything here is a
-function of the trials in the storage and of the study's seed, so nothing is lost with a worker.
+function of the trials in the storage and of the study's seed, so a worker's death loses nothing.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ from armscan.utils.validation import check_float, check_int
 
 TRAINING_SCHEDULE = "training.schedule"
 ACTIVE = (TrialState.RUNNING, TrialState.WAITING)
-# A number is multiplied with one of them, as in the paper.
+# A number is multiplied by one of them, as in the paper.
 FACTORS = (0.8, 1.2)
 Values = dict[str, Any]
 
 
 class PopulationSampler(RandomSampler):
-    """Settings of a population, as a sampler of Optuna, which `study/sampler` requires; see `Population`.
+    """Settings of a population, in the form of an Optuna sampler, which `study/sampler` requires; see `Population`.
 
     Args:
         population: Number of members, 2 or more.
         interval_env_steps: Environment steps of a generation; divides those of the whole training.
-        quantile: Share of the members, above 0 and at most 0.5, that are worst and continue from one of the best, of
-            which there are as many.
-        resample_probability: Probability that a value is drawn again instead of changed by a fifth.
+        quantile: Fraction of the members, above 0 and at most 0.5, that counts as worst; each of these continues from
+            one of equally many best members.
+        resample_probability: Probability of resampling a value instead of changing it by a fifth.
         seed: Seed of the draws. Default: None, other draws each time.
     """
 
@@ -90,8 +90,8 @@ class Population:
     def plan(self, trials: Sequence[FrozenTrial]) -> list[PlannedTrial]:
         """Return the next trial; nothing while all members train, and at the end.
 
-        It is that of the member that is furthest behind. A member among the worst of its generation so far continues
-        from a checkpoint of one of the best, with changed values; so does one whose training has failed.
+        The member that is furthest behind trains next. A member among the worst of its generation so far continues from
+        a checkpoint of one of the best, with changed values; so does one whose training has failed.
 
         Args:
             trials: All trials of the study.
@@ -117,7 +117,8 @@ class Population:
     def checkpoints_to_keep(self, trials: Sequence[FrozenTrial]) -> set[int]:
         """Return the numbers of the trials from whose last checkpoints a member may still continue.
 
-        Those of a generation that all members have passed are not among them, nor those that cannot be among the best.
+        A trial is dropped once all members have finished the next generation, or once its own member has, unless the
+        trial is among the best.
 
         Args:
             trials: All trials of the study.
@@ -125,14 +126,14 @@ class Population:
         trials = _members(trials)
         active = [trial for trial in trials if trial.state in ACTIVE]
         kept = {trial.number for trial in active}
-        # A retry begins from what the attempt before has left, or from the same parent again.
+        # A retry begins from the checkpoint of the attempt before, or from the same parent again.
         kept |= {trial.user_attrs[name] for trial in active for name in (RETRY_OF, PARENT) if name in trial.user_attrs}
         n_best = math.ceil(self.settings.quantile * self.settings.population)
         passed = {_place(trial) for trial in trials if trial.state in FINISHED}
         for generation in range(self.n_generations - 1):
             behind = {each for each in range(self.settings.population) if (generation + 1, each) not in passed}
             ranked = self._ranked(trials, generation)
-            # Others that complete this generation can only push a trial down.
+            # Trials that complete this generation later can only lower a trial's rank.
             kept |= {trial.number for trial in ranked[:n_best] if behind}
             kept |= {trial.number for trial in ranked if trial.user_attrs[MEMBER] in behind}
         return kept
@@ -177,7 +178,7 @@ class Population:
         return {each.name: _draw(each.name, each.distribution, rng) for each in self.space.parameters}
 
     def _explored(self, values: Mapping[str, Any], rng: np.random.Generator) -> Values:
-        """Return changed values."""
+        """Return values, each changed by a fifth or drawn again."""
         explored = {}
         for each in self.space.parameters:
             if rng.random() < self.settings.resample_probability:
@@ -188,7 +189,7 @@ class Population:
 
 
 def searched_values(trial: FrozenTrial | Trial) -> Values:
-    """Return the values of a trial by their keys; of a member with what has changed since its beginning."""
+    """Return the values of a trial by key; a member's first values, with later changes as `training.schedule`."""
     schedule = trial.user_attrs.get(SCHEDULE)
     if not schedule:
         return dict(trial.params)
@@ -220,12 +221,12 @@ def _has_failed(trial: FrozenTrial) -> bool:
 
 def _draw(name: str, distribution: BaseDistribution, rng: np.random.Generator) -> Any:
     sampler = RandomSampler(int(rng.integers(2**31)))
-    # Neither study nor trial has a part in it.
+    # The sampler uses neither study nor trial.
     return sampler.sample_independent(cast(Any, None), cast(Any, None), name, distribution)
 
 
 def _perturb(value: Any, distribution: BaseDistribution, rng: np.random.Generator) -> Any:
-    """Return a value a fifth higher or lower, within its range; a choice beside it."""
+    """Return a value a fifth higher or lower, within its range; for a choice, one of its neighbours."""
     is_up = bool(rng.integers(2))
     if isinstance(distribution, CategoricalDistribution):
         choices = distribution.choices

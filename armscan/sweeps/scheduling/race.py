@@ -1,9 +1,9 @@
 """Race of configurations over seeds: which trainings come next, and which configuration is chosen.
 
-A few seeds first, for all; then more, in rounds, for the configurations where they most increase the probability of a
-correct selection: the optimal computing budget allocation (OCBA) of Chen et al. (2000, doi:10.1023/A:1008349927281).
-Everything here is a function of the scores alone: workers that see the same storage decide the same, and a race that
-was interrupted continues where it was.
+All configurations first get a few seeds. Further seeds go, in rounds, to the configurations where they most increase
+the probability of a correct selection: the optimal computing budget allocation (OCBA) of Chen et al. (2000,
+doi:10.1023/A:1008349927281). Everything here is a function of the scores alone, so workers that see the same storage
+decide the same, and an interrupted race continues where it was.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from scipy.special import stdtrit
 from armscan.stats.bootstrap import LEVEL, Estimate
 from armscan.utils.arrays import FloatArray
 
-# Level of the one-sided t tests of the leader against each other configuration, for an early end of the race, and the
-# seeds that the leader must have then: with fewer, it may be lucky.
+# For an early end of the race: the level of the one-sided t tests of the leader against each other configuration, and
+# the seeds that the leader must have, because with fewer it may be lucky.
 END_LEVEL, LEADER_SEEDS = 0.95, 4
-# The most seeds of a configuration, as a multiple of the seeds on average.
+# Maximum number of seeds of a configuration, as a multiple of `mean_seeds`.
 MAX_SEEDS_FACTOR = 4
-# Prior degrees of freedom: the weight of the pooled variance in that of each configuration, of which two or three seeds
-# say little.
+# Prior degrees of freedom: the weight of the pooled variance in each configuration's variance, which two or three seeds
+# estimate poorly.
 PRIOR_DF = 4.0
-# Least gap between two means, as a share of the largest mean, and in any case: gaps are divisors. So are variances, to
-# which the square of the gap is added.
+# Minimum gap between two means, relative to the largest mean and absolute, because gaps are divisors. So are variances,
+# to which the square of the gap is added.
 MIN_RELATIVE_GAP, MIN_GAP = 1e-6, 1e-100
 
 UNKNOWN = Estimate(math.nan, math.nan, math.nan)
@@ -61,10 +61,10 @@ class Standing:
 
 @dataclass(frozen=True)
 class Race:
-    """A race as it stands.
+    """State of a race.
 
     Args:
-        n_trained: Trainings of the race that have a score.
+        n_trained: Number of trainings that have a score.
         missing: Trainings of this round without a score, the running ones included, as pairs of a configuration and a
             seed. Empty if the race is over.
         chosen: Configuration that was chosen; None while the race continues, or if all configurations have failed in
@@ -93,32 +93,32 @@ class Race:
 def race(scores: Scores, seeds: Sequence[int], *, min_seeds: int, mean_seeds: int) -> Race:
     """Return the state of a race.
 
-    All configurations are trained with the first `min_seeds` seeds. Each further round has a third as many trainings as
-    configurations are left, two at least, for those where they most increase the probability of a correct selection.
-    The race is over when each configuration has `mean_seeds` seeds on average, when the leader is ahead of all others
-    by more than chance explains (one-sided t tests), or when one configuration is left. The one with the highest lower
-    end of its interval is chosen; the first of equal ones.
+    All configurations are trained with the first `min_seeds` seeds. Each further round has one training for every three
+    configurations that are left, at least two, where they most increase the probability of a correct selection. The
+    race is over when the configurations have `mean_seeds` seeds on average, when the leader is ahead of all others by
+    more than chance explains (one-sided t tests), or when one configuration is left. The one whose interval has the
+    highest lower end is chosen; the first of equal ones.
 
     Args:
         scores: Score of each finished training by configuration and seed, the higher the better. NaN for a failed
             training, which drops its configuration at the end of the round. A configuration without any score is a key
             too.
-        seeds: All seeds of the race, in the order in which they are used: `min_seeds` or more, the most that a
+        seeds: All seeds of the race, in the order in which they are used: at least `min_seeds`, and as many as one
             configuration may get.
         min_seeds: Number of seeds that all configurations get, 1 or more.
-        mean_seeds: Number of seeds of a configuration on average, at most; `min_seeds` or more.
+        mean_seeds: Maximum number of seeds per configuration on average, `min_seeds` or more.
     """
     left, standings = list(scores), {configuration: Standing() for configuration in scores}
     n_seeds, most = dict.fromkeys(scores, min_seeds), mean_seeds * len(scores)
     while True:
         due = [(each, seed) for n, seed in enumerate(seeds) for each in left if n < n_seeds[each]]
         if missing := tuple((each, seed) for each, seed in due if seed not in scores[each]):
-            # Not before the round is complete: what is run must not depend on which training ends first.
+            # Decide nothing before the round is complete: the trainings must not depend on which of them ends first.
             return Race(sum(n_seeds.values()) - len(missing), missing, None, standings)
         rows = {each: [scores[each][seed] for seed in seeds[: n_seeds[each]]] for each in left}
         whole = [each for each in left if not any(map(math.isnan, rows[each]))]
         if not whole:
-            # Of the round before, which had no failure; none in the first.
+            # All have failed in this round: choose by the round before, or choose none if this is the first.
             left = [each for each in left if standings[each].n_seeds]
             standings |= {each: replace(standings[each], has_failed=True) for each in standings}
             break
@@ -136,7 +136,7 @@ def race(scores: Scores, seeds: Sequence[int], *, min_seeds: int, mean_seeds: in
 
 
 def budget(n_configurations: int, *, min_seeds: int, mean_seeds: int) -> tuple[int, int]:
-    """Return a lower and an upper bound of the trainings of a race in which none fails."""
+    """Return a lower and an upper bound on the number of trainings of a race in which none fails."""
     if n_configurations == 1:
         return min_seeds, min_seeds
     least, most, size = n_configurations * min_seeds, n_configurations * mean_seeds, round_size(n_configurations)
@@ -144,7 +144,7 @@ def budget(n_configurations: int, *, min_seeds: int, mean_seeds: int) -> tuple[i
 
 
 def round_size(n_configurations: int) -> int:
-    """Return the trainings of a round after the first: few, because each round knows the scores of those before."""
+    """Return the number of trainings of a round after the first: few, because each round uses all earlier scores."""
     return max(2, n_configurations // 3)
 
 
@@ -153,12 +153,12 @@ def moments(scores: FloatArray, n_seeds: Counts) -> tuple[FloatArray, FloatArray
 
     Args:
         scores: Scores, shape (..., configurations, seeds).
-        n_seeds: Seeds of each configuration that count, the first ones, shape (..., configurations), 1 or more.
+        n_seeds: Number of seeds of each configuration, whose scores come first, shape (..., configurations), 1 or more.
     """
     counts = np.arange(scores.shape[-1]) < n_seeds[..., np.newaxis]
     means = np.where(counts, scores, 0.0).sum(axis=-1) / n_seeds
     squares = np.where(counts, (scores - means[..., np.newaxis]) ** 2, 0.0).sum(axis=-1)
-    # One seed says nothing of the variance.
+    # One seed does not give a variance.
     own, is_known = squares / np.maximum(n_seeds - 1, 1), n_seeds > 1
     pooled = own.sum(axis=-1, keepdims=True) / np.maximum(is_known.sum(axis=-1, keepdims=True), 1)
     return means, moderated_variances(own, pooled, n_seeds)
@@ -178,7 +178,7 @@ def moderated_variances(own: FloatArray, pooled: Any, n_seeds: Any) -> FloatArra
 
 
 def half_widths(variances: FloatArray, n_seeds: Any) -> FloatArray:
-    """Return half the widths of the 95 % intervals of means, Student's with shrunk variances.
+    """Return the half-widths of the 95 % intervals of means: Student's t intervals with shrunk variances.
 
     Args:
         variances: Variance of the scores of each configuration.
@@ -203,14 +203,14 @@ def is_decided(means: FloatArray, variances: FloatArray, n_seeds: Counts) -> NDA
 
 
 def allocate(means: FloatArray, variances: FloatArray, n_seeds: Counts, n_more: int, *, most: int) -> Counts:
-    """Return the seeds of each configuration after more of them are given out, shape (..., configurations).
+    """Return the number of seeds of each configuration once more are allocated, shape (..., configurations).
 
     Args:
         means: Mean score of each configuration, shape (..., configurations), two or more.
         variances: Variance of the scores of each, likewise.
         n_seeds: Seeds of each, likewise.
-        n_more: Seeds to give out, no more than `most` leaves.
-        most: Most seeds of a configuration.
+        n_more: Number of seeds to allocate, no more than `most` allows.
+        most: Maximum number of seeds of a configuration.
     """
     places, leader = np.arange(means.shape[-1]), means.argmax(axis=-1)[..., np.newaxis]
     least_gap = np.maximum(MIN_RELATIVE_GAP * np.abs(means).max(axis=-1, keepdims=True), MIN_GAP)
@@ -229,7 +229,7 @@ def allocate(means: FloatArray, variances: FloatArray, n_seeds: Counts, n_more: 
 def _standings(means: FloatArray, variances: FloatArray, n_seeds: Counts) -> Iterator[Standing]:
     """Yield the standings after a round."""
     half = half_widths(variances, n_seeds)
-    # With one seed each, nothing is known of chance.
+    # With one seed each, the variance is unknown.
     half = half if n_seeds.max() > 1 else np.full_like(half, math.nan)
     for mean, width, n in zip(means.tolist(), half.tolist(), n_seeds.tolist(), strict=True):
         yield Standing(Estimate(mean, mean - width, mean + width), n)

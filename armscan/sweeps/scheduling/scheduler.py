@@ -1,6 +1,6 @@
 """Trial scheduler: claims, requeues, and retries after a worker's death.
 
-It decides from what is in the storage, one process at a time, and keeps nothing in memory that a worker's death loses.
+It decides from the storage alone, one process at a time, so a worker's death loses nothing.
 """
 
 from __future__ import annotations
@@ -51,10 +51,10 @@ class TrialScheduler:
     Args:
         study: The study in its storage.
         storage: The storage.
-        limits: When the study ends.
-        plan: Returns the trials to enqueue next, from what is in the storage, of a study that makes none by itself.
-            Default: None, its sampler makes them.
-        termination: Ends the study by itself. Default: None, nothing does.
+        limits: Limits at which the study ends.
+        plan: Function that returns the trials to enqueue next, derived from the storage. Default: None, Optuna's
+            sampler proposes the trials.
+        termination: Ends the study before its last trial. Default: None, nothing does.
     """
 
     def __init__(
@@ -77,11 +77,11 @@ class TrialScheduler:
         return StudyState.of(self.study.get_trials(deepcopy=False))
 
     def claim(self, lease: Mapping[str, Any], outcome: TrialOutcome | None = None) -> Trial | None:
-        """Tell the outcome of a trial, and claim the next: a waiting one if there is one, else a new one.
+        """Tell Optuna the outcome of a trial, and claim the next: a waiting one if there is one, else a new one.
 
         Args:
             lease: Lease of the worker that claims the trial.
-            outcome: Outcome of the worker's trial before, if any; its `is_told` is set.
+            outcome: Outcome of the worker's previous trial, whose `is_told` is set. Default: None, there is none.
 
         Returns:
             The trial; None if there is none now, because enough are running or the study has ended.
@@ -93,7 +93,7 @@ class TrialScheduler:
             if outcome is not None:
                 self._tell(outcome, is_repeated=is_repeated)
             state = self.state()
-            # If the storage became unavailable in the middle, one may have been claimed, and only the answer been lost.
+            # If the storage became unavailable midway, a trial may have been claimed, and only the reply lost.
             own = [trial for trial in state.running if is_repeated and trial.user_attrs.get(LEASE) == lease]
             is_repeated = True
             if own:
@@ -113,7 +113,7 @@ class TrialScheduler:
         trial = outcome.trial
         now = self.study._storage.get_trial(trial._trial_id).state
         if now != TrialState.RUNNING:
-            # Others end a worker's trial only as failed; or it was this worker, and the answer was lost.
+            # Other workers can only fail this trial; any other state was told by this one, and the reply was lost.
             outcome.is_told = is_repeated and now == outcome.state
             return
         for name, value in outcome.attributes.items():
@@ -129,7 +129,7 @@ class TrialScheduler:
         is_enough = len(state.finished) + len(state.running) >= self.limits.n_trials
         planned = () if is_enough or self._plan is None or state.waiting else self._plan()
         has_next = not is_enough and (self._plan is None or bool(state.waiting or planned))
-        # What comes of a running trial may be planned with.
+        # The outcome of a running trial may lead to another one.
         if not has_next and not state.running:
             return ClaimStatus(f"{len(state.finished)} trials have finished, {len(state.failed)} failed")
         reason = self.limits.limit_reason(state)
@@ -155,7 +155,7 @@ class TrialScheduler:
         return self.limits.failure_reason(state, reset)
 
     def check_termination(self, state: StudyState | None = None) -> None:
-        """Look whether the study ends before its last trial; see `Termination.check`."""
+        """Check whether the study ends before its last trial; see `Termination.check`."""
         if self.termination is not None:
             self.termination.check(state or self.state())
 
@@ -176,7 +176,7 @@ class TrialScheduler:
         """Ignore the failures so far if they have ended the study, because it is started again.
 
         Returns:
-            How many there were; 0 if they have not ended it.
+            The number of ignored failures; 0 if they have not ended it.
         """
         state = self.state()
         if self.failure_reason(state) is None:
@@ -192,10 +192,10 @@ class TrialScheduler:
             now = storage.get_trial(trial_id)
             holder = now.user_attrs.get(LEASE, {})
             is_own = all(holder.get(key) == lease[key] for key in HOLDER if key in lease)
-            # Not if this worker was taken for dead, nor if only the answer was lost and another has claimed it since.
+            # Not if this worker was taken for dead, nor if only the reply was lost and another has claimed it since.
             if now.state == TrialState.RUNNING and is_own:
                 (writes or PendingWrites()).write()
-                # No process: a worker that claims it and dies before writing its lease must not be taken for this one.
+                # Names no process: a worker that dies between claim and lease must not be taken for this one.
                 storage.set_trial_user_attr(trial_id, LEASE, {**lease, "started": "", BEAT_S: time.time()})
                 storage.set_trial_state_values(trial_id, TrialState.WAITING)
 
@@ -226,18 +226,18 @@ class TrialScheduler:
         return self.storage.transaction(renewed)
 
     def reclaim(self, is_dead: Callable[[FrozenTrial], bool], seen: StudyState | None = None) -> list[FrozenTrial]:
-        """Fail the trials of dead workers, enqueue a retry of each that has one left, and return those that failed.
+        """Fail the trials of dead workers, enqueue a retry where one is left, and return the failed trials.
 
         Args:
             is_dead: Function that returns whether the worker of a running trial is dead.
-            seen: State of the study a moment ago. Default: None, read it now.
+            seen: Recent state of the study. Default: None, read it now.
         """
 
         def lost(state: StudyState) -> list[FrozenTrial]:
             # A claim writes the lease before others can see the trial.
             return [trial for trial in state.running if LEASE not in trial.user_attrs or is_dead(trial)]
 
-        # First without the lock: hardly ever is a trial lost.
+        # First without the lock: trials are rarely lost.
         if not lost(seen or self.state()):
             return []
         reclaimed: dict[int, FrozenTrial] = {}
@@ -257,11 +257,11 @@ class TrialScheduler:
         attributes: dict[str, Any] = {FAILURE: reason, ENV_STEPS: env_steps_of(trial)}
         if attempt < self.limits.max_retries:
             attributes[RETRIED] = True
-            # First, so that a death between the two loses nothing: the next worker finds it.
+            # First, so that a death before the trial has failed loses nothing: the next worker finds the retry.
             if not any(other.user_attrs.get(RETRY_OF) == trial.number for other in state.all):
                 kept = {name: value for name, value in trial.user_attrs.items() if name in KEPT_BY_RETRY}
                 of_retry = kept | {RETRY_OF: trial.number, ATTEMPT: attempt + 1}
-                # What it was enqueued with, too: its worker may have died before it asked for its values.
+                # With the values that it was enqueued with: its worker may have died before it sampled them.
                 params = {**trial.system_attrs.get(FIXED_PARAMS, {}), **trial.params}
                 self.study.enqueue_trial(renamed(params), user_attrs=of_retry)
         for name, value in attributes.items():

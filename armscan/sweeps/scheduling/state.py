@@ -18,12 +18,12 @@ from armscan.utils.arrays import FloatArray
 from armscan.utils.section import Section
 
 T = TypeVar("T")
-# In place of the number of a finalist: the configuration of the study without what it searches.
+# In place of a trial's number: the control, which is the configuration of the study without the searched values.
 CONTROL = -1
-# How the names of metrics on the test volumes begin.
+# Prefix of the names of metrics on the test volumes.
 TEST_PREFIX = "test/"
 FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
-# In a lease: when its worker renewed it last, on the wall clock of its machine, in seconds since 1970.
+# In a lease: when its worker last renewed it, by the wall clock of its machine, in seconds since 1970.
 BEAT_S = "beat_s"
 # If this many trials fail before any reports, the configuration is at fault.
 FAILURES_AT_ONCE = 3
@@ -39,7 +39,7 @@ class StudyState:
         waiting: Requeued trials and enqueued retries.
         failed: Trials that raised, or whose workers died too often.
         retried: Attempts whose worker died, and that were retried.
-        taken: Finished trials of other studies, which count nowhere.
+        taken: Finished trials taken from other studies, which do not count.
     """
 
     finished: tuple[FrozenTrial, ...]
@@ -51,7 +51,7 @@ class StudyState:
 
     @classmethod
     def of(cls, trials: Sequence[FrozenTrial]) -> Self:
-        """Sort trials."""
+        """Group trials by their state."""
         taken = [trial for trial in trials if TAKEN_FROM in trial.user_attrs]
         trials = [trial for trial in trials if TAKEN_FROM not in trial.user_attrs]
         ended = [trial for trial in trials if trial.state == TrialState.FAIL]
@@ -82,11 +82,11 @@ class StudyState:
 
     @property
     def busy_hours(self) -> float:
-        """Wall time in which at least one trial ran."""
+        """Wall time in hours during which at least one trial ran."""
         busy_s, until = 0.0, datetime.min
         spans = [(trial.datetime_start, _last_seen(trial)) for trial in self.all if trial.datetime_start]
         for start, end in sorted(spans):
-            # Not so where the clock was turned back meanwhile.
+            # False within an earlier span, and if the clock was set back meanwhile.
             if end > max(start, until):
                 busy_s += (end - max(start, until)).total_seconds()
                 until = end
@@ -94,7 +94,7 @@ class StudyState:
 
 
 def _last_seen(trial: FrozenTrial) -> datetime:
-    """Return when a trial ended, or when its worker was last heard of if that died or has requeued the trial."""
+    """Return when a trial ended; for one that has not finished, its worker's last heartbeat."""
     beat_s = trial.user_attrs.get(LEASE, {}).get(BEAT_S)
     if trial.state not in FINISHED and beat_s is not None:
         return datetime.fromtimestamp(beat_s)
@@ -102,7 +102,7 @@ def _last_seen(trial: FrozenTrial) -> datetime:
 
 
 def metrics_of_test(metrics: Mapping[str, float]) -> dict[str, float]:
-    """Return those of a trial's metrics that are of the test volumes, by their names without the prefix."""
+    """Return a trial's metrics on the test volumes, by their names without the prefix."""
     return {name.removeprefix(TEST_PREFIX): each for name, each in metrics.items() if name.startswith(TEST_PREFIX)}
 
 
@@ -127,11 +127,12 @@ class Limits(Section):
 
     Args:
         n_trials: Number of trials to finish, 1 or more.
-        max_failures: Largest number of failed trials, without retried ones, 0 or more; one more ends the study.
+        max_failures: Maximum number of failed trials, without retried ones, 0 or more; one more ends the study.
             Default: 10.
         max_retries: Number of retries of a trial whose worker died, 0 or more. Default: 1.
-        timeout_hours: Time in which at least one trial of the search runs, in hours, above 0. Default: None, no limit.
-        max_env_steps: Environment steps of all trials of the search, 1 or more. Default: None, no limit.
+        timeout_hours: Maximum time in hours during which at least one trial of the search runs, above 0. Default: None,
+            no limit.
+        max_env_steps: Maximum environment steps of all trials of the search, 1 or more. Default: None, no limit.
     """
 
     n_trials: int = Field(ge=1, description="a whole number of at least 1")
@@ -143,7 +144,7 @@ class Limits(Section):
     max_env_steps: int | None = Field(default=None, ge=1, description="a whole number of at least 1, or null")
 
     def limit_reason(self, state: StudyState) -> str | None:
-        """Return which of time and environment steps is spent, so that running trials stop; None if neither is."""
+        """Return which limit, time or environment steps, is reached and stops running trials; None if neither is."""
         if self.timeout_hours is not None and state.busy_hours >= self.timeout_hours:
             return f"the {self.timeout_hours:g} hours of study.timeout_hours are over"
         if self.max_env_steps is not None and state.env_steps >= self.max_env_steps:
@@ -151,11 +152,11 @@ class Limits(Section):
         return None
 
     def failure_reason(self, state: StudyState, reset: Collection[int]) -> str | None:
-        """Return why failures end the study, those of trials with the numbers `reset` ignored; None if they do not."""
+        """Return why failures end the study, ignoring trials with the numbers `reset`; None if they do not."""
         failed = [trial for trial in state.failed if trial.number not in reset]
         if len(failed) > self.max_failures:
             return f"{len(failed)} trials have failed, and at most {self.max_failures} may: {_reason(failed[-1])}"
-        # A final training never reports.
+        # Final trainings never report, so their environment steps count, too.
         got_nowhere = not state.finished and not any(reports_of(each) or env_steps_of(each) for each in state.all)
         if len(failed) >= FAILURES_AT_ONCE and got_nowhere:
             return f"the first {len(failed)} trials failed before they reported anything: {_reason(failed[0])}"
@@ -167,10 +168,10 @@ def _reason(trial: FrozenTrial) -> str:
 
 
 class PendingWrites(list[Callable[[], object]]):
-    """Short writes about a trial, which go with its next report, its outcome or its requeue.
+    """Short writes about a trial, sent with its next report, its outcome or its requeue.
 
-    Each is repeated if the storage became unavailable before the write was known to be there. One thread appends and
-    flushes; a requeue writes in another.
+    Each is repeated if the storage became unavailable before it confirmed the write. One thread appends and flushes; a
+    requeue may write from another.
     """
 
     def write(self) -> int:
@@ -196,10 +197,10 @@ class PendingWrites(list[Callable[[], object]]):
 
 @dataclass(frozen=True)
 class PlannedTrial:
-    """A trial that is to be enqueued.
+    """A trial to enqueue.
 
     Args:
-        params: Its values by the names of the parameters.
+        params: Its values by parameter name.
         attributes: Its user attributes.
     """
 
@@ -214,7 +215,7 @@ class ClaimStatus:
     Args:
         end_reason: Why no further trial is claimed; None while trials are missing.
         can_claim: Whether one can be claimed now. Default: False.
-        planned: Trials to enqueue before. Default: none.
+        planned: Trials to enqueue before claiming. Default: none.
     """
 
     end_reason: str | None
@@ -239,5 +240,5 @@ class TrialOutcome:
     writes: PendingWrites
     values: Sequence[float] | None = None
     attributes: Mapping[str, Any] = field(default_factory=dict)
-    # Not if another worker has taken this one for dead, and the trial is theirs.
+    # Stays False if another worker has taken this one for dead, and taken over the trial.
     is_told: bool = field(default=False, init=False)

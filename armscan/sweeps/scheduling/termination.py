@@ -1,4 +1,4 @@
-"""The end of a study before its last trial: found once, kept in the storage, and the same for every worker."""
+"""The end of a study before its last trial: decided once, stored, and the same for every worker."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from armscan.sweeps.scheduling.state import StudyState
 from armscan.sweeps.storage.attribute_names import TERMINATED
 from armscan.sweeps.storage.storage import Storage
 
-# In the attribute of a study that has ended.
+# Keys of the attribute of a study that has ended.
 REASON, ASKED = "reason", "asked"
 
 
@@ -21,7 +21,7 @@ class Termination:
         study: The study in its storage.
         storage: The storage.
         find_reason: Function that returns why a study ends, None if it continues. It may take seconds.
-        asked: Trials and terminator asked for, as a string; an ended study continues if it has changed.
+        asked: Requested number of trials and terminator, as a string; an ended study continues if it changes.
     """
 
     def __init__(
@@ -29,7 +29,7 @@ class Termination:
     ) -> None:
         self._study, self._storage = study, storage
         self._find_reason, self._asked = find_reason, asked
-        # Finished trials at the last look: nothing new can be found without another.
+        # Finished trials at the last check: nothing new can be found without another.
         self._n_seen = -1
 
     @property
@@ -38,7 +38,7 @@ class Termination:
         return ended_because(self._study, self._asked)
 
     def check(self, state: StudyState) -> None:
-        """Look whether the study ends, once for each number of finished trials, without holding the lock."""
+        """Check whether the study ends, once for each number of finished trials, without holding the lock."""
         n_seen = len(state.finished)
         if n_seen == self._n_seen:
             return

@@ -1,4 +1,4 @@
-"""A dimension of a search space, and its values: as Optuna keeps them, and as the command line has them."""
+"""A dimension of a search space, and its values as Optuna stores them and as the command line has them."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class _Range(_Searched):
         given = {key: value for key in ("low", "high", "step") if (value := getattr(self, key)) is not None}
         kind: Any = IntDistribution if all(isinstance(each, int) for each in given.values()) else FloatDistribution
         with warnings.catch_warnings():
-            # Of steps that do not meet the upper end.
+            # Optuna warns if the steps do not meet the upper end.
             warnings.simplefilter("error")
             made: BaseDistribution = kind(**given, log=self.log)
         return made
@@ -77,7 +77,7 @@ class Parameter:
         """Return the parameter of a description such as `{low: 1e-4, high: 1e-2, log: true}` or `{choices: [a, b]}`."""
         where = f"study.space.{name}"
         if isinstance(described, Mapping):
-            # What the command line takes away.
+            # The command line removes a key by setting it to null.
             described = {key: value for key, value in described.items() if value is not None}
         if not KEY.fullmatch(name):
             raise InvalidValueError(f"{where}: {name!r} is not a key of the configuration, such as agent.lr")
@@ -97,11 +97,11 @@ class Parameter:
         return cls(name, distribution, {key: tuple(map(optuna_value, values)) for key, values in several.items()})
 
     def applies(self, chosen: Mapping[str, Value]) -> bool:
-        """Return whether it is searched where these values were chosen before."""
+        """Return whether it is searched, given the values that were chosen before."""
         return all(name in chosen and chosen[name] in values for name, values in self.when.items())
 
     def contains(self, value: Any) -> bool:
-        """Return whether a value, as Optuna keeps it, lies in its range or is one of its choices."""
+        """Return whether a value, as Optuna stores it, lies in its range or is one of its choices."""
         drawn: Any = self.distribution
         if isinstance(drawn, CategoricalDistribution):
             return any(type(value) is type(choice) and value == choice for choice in drawn.choices)
@@ -112,7 +112,7 @@ class Parameter:
         """Return the value of a trial.
 
         Raises:
-            InvalidValueError: If the storage has another value for it than the space has.
+            InvalidValueError: If its value in the storage is not in the space.
         """
         drawn: Any = self.distribution
         refused = f"{self.name} has a value in the study's storage that is not in study.space"
@@ -131,24 +131,24 @@ class Parameter:
 
     @property
     def extremes(self) -> tuple[Value, ...]:
-        """The values that have to be allowed for all of them to be."""
+        """The values to check so that all are allowed: every choice, or both ends of the range."""
         drawn: Any = self.distribution
         return tuple(drawn.choices) if isinstance(drawn, CategoricalDistribution) else (drawn.low, drawn.high)
 
 
 def optuna_value(value: Any) -> Value:
-    """Return a value as Optuna stores it: a number or a string, a list as the string that Hydra reads."""
+    """Return a value as Optuna stores it; a list or mapping becomes the string that Hydra reads."""
     kept: Value = hydra_literal(value) if isinstance(value, list | tuple | Mapping) else value
     return kept
 
 
 def overrides_of(chosen: Mapping[str, Value]) -> list[str]:
-    """Return values as they are written on the command line, those of earlier versions by their new names."""
+    """Return values as overrides of the command line; keys of earlier versions get their new names."""
     return [f"{name}={hydra_literal(value)}" for name, value in renamed(chosen).items()]
 
 
 def rounded_overrides(chosen: Mapping[str, Value]) -> list[str]:
-    """Return values likewise, with four digits, for tables."""
+    """Return values as overrides with four significant digits, for tables."""
     return overrides_of(
         {key: float(f"{each:.4g}") if isinstance(each, float) else each for key, each in chosen.items()}
     )
@@ -164,7 +164,7 @@ def hydra_literal(value: Any) -> str:
         return f"[{','.join(map(hydra_literal, value))}]"
     if isinstance(value, Mapping):
         return "{" + ",".join(f"{key}:{hydra_literal(each)}" for key, each in value.items()) + "}"
-    # Neither that of a list, nor one in which nothing but a string is read.
+    # Not the literal of a list or mapping, nor a string that Hydra reads as one anyway.
     if isinstance(value, str) and not value.startswith(("[", "{")) and not PLAIN_TEXT.fullmatch(value):
         return QuotedString(value, Quote.single).with_quotes()
     return str(value)

@@ -21,7 +21,7 @@ class Space:
 
     @classmethod
     def read(cls, described: Any) -> Self:
-        """Return the space of a mapping from keys of the configuration to descriptions; null takes a key out."""
+        """Return the space of a mapping from keys of the configuration to descriptions; null removes a key."""
         if not isinstance(described, Mapping) or not described:
             raise InvalidValueError(f"study.space is {described!r}, but it must have at least one key to search")
         space = cls(tuple(Parameter.read(name, each) for name, each in described.items() if each is not None))
@@ -49,14 +49,15 @@ class Space:
         return chosen
 
     def fit(self, values: Mapping[str, Value], *, partly: bool = False) -> tuple[dict[str, Value], str | None]:
-        """Return the values of a trial that lie in the space, and those that do not.
+        """Return the values of a trial that lie in the space, and the first misfit.
 
         Args:
             values: Values by name, as Optuna stores them; those of other keys are left out.
             partly: Whether values may be missing. Default: False.
 
         Returns:
-            The values of the parameters that apply, and the first that is missing or lies outside, None if none is.
+            The values of the parameters that apply; and a message about the first that is missing or lies outside, None
+            if none is.
         """
         chosen: dict[str, Value] = {}
         misfit = None
@@ -72,9 +73,9 @@ class Space:
         return chosen, misfit
 
     def extremes(self) -> Iterator[dict[str, Value]]:
-        """Yield values by name that between them have every choice and both ends of every range.
+        """Yield sets of values by name that together cover every choice and both ends of every range.
 
-        Each is the last, and before it stand the choices of others that it needs.
+        Each of these values comes last in its set, after the choices of other parameters that it requires.
         """
         for parameter in self.parameters:
             for value in parameter.extremes:
@@ -83,7 +84,7 @@ class Space:
                 yield chosen
 
     def completed(self, chosen: Mapping[str, Value]) -> dict[str, Value]:
-        """Return choices with a value of every other parameter that is searched beside them, as in a trial."""
+        """Return choices with a value of every other parameter that is searched with them, as in a trial."""
         complete: dict[str, Value] = {}
         for parameter in self.parameters:
             if parameter.name in chosen or parameter.applies(complete):
@@ -91,7 +92,7 @@ class Space:
         return complete
 
     def _with_needs(self, name: str, value: Value) -> dict[str, Value] | None:
-        """Return a value with the choices that it needs before it, None if these exclude each other."""
+        """Return a value after the choices that it requires; None if these exclude each other."""
         allowed: dict[str, tuple[Value, ...]] = {name: (value,)}
         for parameter in reversed(self.parameters):
             for needed, values in parameter.when.items() if parameter.name in allowed else ():
@@ -114,7 +115,7 @@ class Space:
         return Space(tuple(kept.values()))
 
     def to_plain(self) -> dict[str, str]:
-        """Return the space in a form that can be compared and kept."""
+        """Return the space as strings that can be stored and compared."""
         return {
             each.name: distribution_to_json(each.distribution) + (f" when {dict(each.when)}" if each.when else "")
             for each in self.parameters

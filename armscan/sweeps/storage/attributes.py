@@ -1,4 +1,4 @@
-"""Check the attributes and values of a stored study whenever they are read: a stranger may have written them."""
+"""Check the attributes and values of a stored study on each read: a stranger may have written them."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from armscan.sweeps.storage.reports import REPORT
 from armscan.utils.section import Section
 from armscan.utils.validation import MAX_SEED
 
-# The studies of the final trainings are called like the study, with these suffixes: those that choose a configuration,
-# and those that judge it.
+# Suffixes to a study's name for the studies of its final trainings: those that select a configuration, and those that
+# judge it.
 SELECTION_SUFFIX, JUDGEMENT_SUFFIX = FINAL_SUFFIXES = ("-selection", "-judged")
-# What Optuna's readers raise on what Optuna has not written.
+# Errors that Optuna raises when it reads data that it has not written.
 DAMAGED = (ValueError, TypeError, AttributeError, AssertionError)
 UNREADABLE = (*DAMAGED, LookupError)
 MAX_REASON_CHARS = 300
@@ -28,21 +28,21 @@ MAX_REASON_CHARS = 300
 LARGEST = 2**63 - 1
 MAX_STEP_DIGITS = 18
 Number = Annotated[int, Field(ge=0, le=LARGEST, description="a whole number of at least 0")]
-# Nothing that a class is named by.
+# Excludes keys that name a class, such as `agent._target_`.
 ScheduledKey = Annotated[str, Field(pattern=r"^(from_env_steps|agent\.[a-z]\w*)$")]
 Segment = dict[ScheduledKey, bool | int | Annotated[float, Field(allow_inf_nan=False)]]
-# Without what no path can have.
+# Without null characters, which no path can have.
 Text = Annotated[str, Field(pattern=r"^[^\x00]*$", description="a string")]
 
 
 class _Attributes(Section):
-    """User attributes; those of others are ignored."""
+    """User attributes; those of other programs are ignored."""
 
     model_config = ConfigDict(extra="ignore", strict=True, frozen=True)
 
 
 class StudyAttributes(_Attributes):
-    """User attributes of a study; by the names in `attribute_names`."""
+    """User attributes of a study, named as in `attribute_names`."""
 
     space: dict[str, str] = Field(description="strings by the names of keys")
     fixed_config: dict[str, Any] = Field(description="values by the names of keys")
@@ -71,7 +71,7 @@ class _Lease(_Attributes):
 
 
 class TrialAttributes(_Attributes):
-    """User attributes of a trial; by the names in `attribute_names`."""
+    """User attributes of a trial, named as in `attribute_names`."""
 
     lease: _Lease = Field(default=_Lease(), description="what a worker writes")
     env_steps: Number = 0
@@ -101,7 +101,7 @@ class TrialAttributes(_Attributes):
 
 
 def check_trials(study: optuna.Study, *, n_searched: int | None = None) -> None:
-    """Check that the trials of a study in its storage can be worked with.
+    """Check that the trials of a stored study are valid.
 
     Args:
         study: Study to check.
@@ -109,7 +109,7 @@ def check_trials(study: optuna.Study, *, n_searched: int | None = None) -> None:
 
     Raises:
         InvalidValueError: If a user attribute of a trial is of another type than armscan writes.
-        StudyError: If Optuna cannot read the trials, or one lacks what it must have.
+        StudyError: If Optuna cannot read the trials, or one has invalid values or lacks a required attribute.
     """
     try:
         trials = study.get_trials(deepcopy=False)
@@ -148,13 +148,13 @@ def place_of(study_name: str, trial: FrozenTrial) -> str:
 
 
 def unreadable(what: str, error: Exception) -> StudyError:
-    """Return the error of one line that the trials of `what` cannot be read."""
+    """Return a one-line error: the trials of `what` cannot be read."""
     reason = " ".join(str(error).split()) or repr(error)
     return StudyError(f"the trials of {what} cannot be read: {reason[:MAX_REASON_CHARS]}")
 
 
 def _wrong_numbers(trial: FrozenTrial, n_objectives: int) -> str | None:
-    """Return the fault of a trial's values and reports; None if there is none."""
+    """Return what is wrong with a trial's values or reports; None if nothing is."""
     values: Sequence[Any] = trial.values or ()
     if trial.state == TrialState.COMPLETE and (len(values) != n_objectives or not all(map(_is_finite, values))):
         return f"has the values {few(map(repr, values)) or 'None'}, but it must have {n_objectives} finite numbers"

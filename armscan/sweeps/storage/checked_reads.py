@@ -1,4 +1,4 @@
-"""Storages that check the data of studies whenever they read it: others may write to them at any time."""
+"""Storages that check the data of studies on each read: others may write to them at any time."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from armscan.sweeps.storage.attributes import (
 
 
 class CheckedReads(BaseStorage):
-    """Base class, before one of Optuna's storages, of a storage that checks what that one reads."""
+    """Base class, listed before one of Optuna's storages, that checks everything this storage reads."""
 
     # False for Optuna's dashboard, which shows attributes of any type.
     checks_reads = True
@@ -56,7 +56,7 @@ class CheckedReads(BaseStorage):
 
     def get_trial(self, trial_id: int) -> FrozenTrial:
         """Return a trial, with its attributes checked."""
-        # Not a `KeyError`: by that Optuna says that there is none.
+        # Not a `KeyError`, by which Optuna says that there is no such trial.
         with _in_one_line("a study", DAMAGED):
             trial: FrozenTrial = self._stored.get_trial(trial_id)
         if self.checks_reads:

@@ -23,13 +23,13 @@ from armscan.utils.retry import RetryPolicy
 
 T = TypeVar("T")
 NO_SAVEPOINT = "no such savepoint"
-# Of a SQLite file that another process has locked, that cannot be read for now, or whose disk is full.
+# SQLite's errors for a file that another process has locked, that is temporarily unreadable, or whose disk is full.
 UNAVAILABLE_IN_SQLITE = ("SQLITE_BUSY", "SQLITE_LOCKED", "SQLITE_IOERR", "SQLITE_FULL")
-# One of a PostgreSQL database's advisory locks.
+# Key of the advisory lock in a PostgreSQL database.
 ADVISORY_LOCK = 0xA235CA
-# A lost machine holds the lock for so long, until its connection is closed.
+# How long a lost machine holds the lock, until the database closes its connection.
 SILENT_S = 120
-# When a connection counts as lost on which nothing comes back: in seconds, but for the last one, in milliseconds.
+# When a silent connection counts as lost: times in seconds, a number of probes, and the last time in milliseconds.
 TCP = {
     "connect_timeout": 10,
     "keepalives_idle": 10,
@@ -44,12 +44,12 @@ class ConnectionLostError(Exception):
 
 
 def unavailable_reason(error: BaseException) -> str | None:
-    """Return why a database cannot be reached for now; None if the error says that the request is wrong."""
+    """Return why a database is temporarily unavailable; None if the error means something else."""
     is_unavailable = isinstance(error, ConnectionLostError)
-    # Optuna wraps errors, and may have asked again on a connection that was lost: the first one says why.
+    # Optuna wraps errors, and may have retried on a lost connection: the first error has the cause.
     while isinstance(error, ConnectionLostError | StorageInternalError | SQLAlchemyError | sqlite3.Error):
         cause = error.__cause__ or error.__context__
-        # SQLite itself rolls a transaction back for some errors, and then no savepoint of it is there any more.
+        # On some errors SQLite itself rolls back the transaction, and its savepoints no longer exist.
         if cause is None or (isinstance(error, DBAPIError) and NO_SAVEPOINT not in str(error.orig)):
             break
         error = cause
@@ -72,23 +72,23 @@ class _CheckedStorage(CheckedReads, _CachedStorage):
 class DatabaseStorage(_CheckedStorage):
     """An Optuna storage in a database; each call is retried while the database is unavailable.
 
-    A call may be repeated although it was done and only its answer was lost: a value is set again, and a new trial that
-    no worker knows has no lease and is reclaimed. A state is set within a transaction, which looks at it first.
+    A call may be repeated although it succeeded and only its reply was lost: a value is set again, and a new trial that
+    no worker knows of has no lease and is reclaimed. A state is set within a transaction, which reads it first.
     """
 
     def __init__(self, database: RDBStorage, retry_policy: RetryPolicy) -> None:
         super().__init__(database)
         self._retry_policy = retry_policy
-        # Of each thread: `inside`, the storage of its current transaction, and `known`, that of the one before.
+        # Per thread: `inside`, the storage of its current transaction, and `known`, that of the one before.
         self._here = threading.local()
 
     def set_trial_param(self, trial_id: int, name: str, value: float, distribution: BaseDistribution) -> None:
         """See `BaseStorage`."""
-        # A cache refuses trials that it has not seen, such as one that was claimed a moment ago in another.
+        # A cache refuses trials that it has not seen, such as one just claimed through another cache.
         self.transaction(partial(self._backend.set_trial_param, trial_id, name, value, distribution))
 
     def transaction(self, operate: Callable[[], T], *, is_exclusive: bool = False) -> T:
-        """Run an operation in one transaction, and again where the database became unavailable in the middle.
+        """Run an operation in one transaction; repeat it if the database becomes unavailable midway.
 
         Args:
             operate: Function that reads and writes through this storage, in this thread.
@@ -103,9 +103,9 @@ class DatabaseStorage(_CheckedStorage):
 
     def _in_transaction(self, operate: Callable[[], T], is_exclusive: bool) -> T:
         # One transaction on one connection holds the lock and all writes: a lost connection loses both, and leaves
-        # nothing half done. If it is lost during the commit, all or nothing was written: a repeated operation looks.
+        # nothing half done. If it is lost during the commit, all or nothing was written: a repeated operation checks.
         sessions = self._backend.scoped_session
-        # A transaction has a cache of its own, which is kept unless it is rolled back.
+        # A transaction has its own cache, which the next one reuses unless this one is rolled back.
         inside = self._here.__dict__.pop("known", None) or _CheckedStorage(self._backend)
         with self._backend.engine.connect() as connection:
             try:
@@ -130,7 +130,7 @@ class DatabaseStorage(_CheckedStorage):
 
 
 def _retried(name: str, own: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a method of `BaseStorage` that is retried, outside a transaction; inside, that is repeated as a whole."""
+    """Return a method of `BaseStorage` that is retried; inside a transaction, the whole transaction is instead."""
 
     @wraps(own)
     def call(self: DatabaseStorage, *args: Any, **kwargs: Any) -> Any:
@@ -146,7 +146,7 @@ for _name in BaseStorage.__abstractmethods__ - {"set_trial_param"}:
 
 
 def open_database(uri: str, *, retry: bool = False) -> DatabaseStorage:
-    """Open a database, for which `retry` waits while it is unavailable, and create its tables if there are none."""
+    """Open a database, and create its tables if there are none; with `retry`, wait while it is unavailable."""
     logging.getLogger("alembic").setLevel(logging.WARNING)
     retry_policy = RetryPolicy("the storage", f"study.storage is {uri!r}", unavailable_reason, StorageUnavailableError)
     opened = partial(_opened, database_url(uri, STORAGE_PASSWORD))
@@ -176,7 +176,7 @@ def _opened(url: URL) -> RDBStorage:
         return opened()
     engine = create_engine(url, connect_args=TCP)
     try:
-        # Processes that make the tables of an empty database at once get into each other's way.
+        # Processes that create the tables of an empty database at the same time would conflict.
         with engine.begin() as connection:
             _lock(connection)
             return opened()
@@ -185,6 +185,6 @@ def _opened(url: URL) -> RDBStorage:
 
 
 def _lock(connection: Connection) -> None:
-    """Wait for the lock of a database; it is freed when the transaction ends, also by the death of this process."""
+    """Wait for the lock of a database; it is released when the transaction ends, even if this process dies."""
     connection.execute(text(f"SET LOCAL idle_in_transaction_session_timeout = '{SILENT_S}s'"))
     connection.execute(text(f"SELECT pg_advisory_xact_lock({ADVISORY_LOCK})"))

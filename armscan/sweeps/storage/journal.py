@@ -1,4 +1,4 @@
-"""A study's journal file, the default storage: whole lines are appended, each with a checksum of all up to it."""
+"""A study's journal file, the default storage: whole lines are appended, each with a checksum of the file so far."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from armscan.sweeps.storage.checked_reads import CheckedReads
 from armscan.utils.files import FULL_DISK, truncate_torn_line
 from armscan.utils.retry import RetryPolicy
 
-# How every line of a journal begins.
+# Beginning of each line of a journal.
 BEGINNING = b'{"op_code"'
-# How a line ends: with the CRC-32 of the lines before it and of itself up to here. Optuna ignores the key.
+# End of a line: the CRC-32 of the lines before it and of itself up to here. Optuna ignores the key.
 SUM = re.compile(rb',"sum":"([0-9a-f]{8})"\}\n$')
 
 
 def open_journal(path: Path, *, is_written: bool) -> CheckedJournal:
-    """Open a journal; one that is written is created if there is none, and loses a torn last line.
+    """Open a journal; if it is to be written, create it if there is none, and remove a torn last line.
 
     Raises:
         OSError: If no file can be used there.
-        StudyError: If the file is not a journal, or if a line of it but the last was lost or changed.
+        StudyError: If the file is not a journal, or a line before the last was lost or changed.
     """
     journal = JournalFile(path)
     if is_written:
@@ -66,7 +66,7 @@ def _why_full(error: BaseException) -> str | None:
 
 @dataclass(frozen=True)
 class Position:
-    """A position between two lines of a journal: the number, the bytes and the sum of the lines before it."""
+    """A position between two lines of a journal: number, size in bytes and checksum of the lines before it."""
 
     n_lines: int = 0
     end: int = 0
@@ -77,7 +77,7 @@ class JournalFile(BaseJournalBackend):
     """A journal file in which a lost or changed line is noticed, if a line with a checksum follows it.
 
     Lines that earlier versions or Optuna have appended have no checksum of their own; the next checksum includes them.
-    Only lost last lines go unnoticed: they may never have been written.
+    Only the loss of the last lines goes unnoticed: they may never have been written.
     """
 
     def __init__(self, path: Path) -> None:
@@ -93,8 +93,8 @@ class JournalFile(BaseJournalBackend):
     def locked(self) -> Iterator[None]:
         """Hold the lock of the file, which then ends with a whole line.
 
-        The system frees it when a process dies; Optuna's own lock would block all others for 30 s. A line whose writer
-        died is truncated: the next one would be appended to it, and neither could be read.
+        The system releases it when a process dies; Optuna's own lock would block all others for 30 s. A torn line,
+        whose writer died, is removed: the next one would be appended to it, and neither could be read.
         """
         with self._lock:
             truncate_torn_line(self._path)
@@ -112,12 +112,12 @@ class JournalFile(BaseJournalBackend):
                 yield operation
 
     def append_logs(self, logs: list[dict[str, Any]]) -> None:
-        """See `BaseJournalBackend`; a full disk is waited for as a database that is unavailable."""
+        """See `BaseJournalBackend`; retried while the disk is full."""
         self._retry_policy.call(partial(self._append, logs))
 
     def _append(self, logs: list[dict[str, Any]]) -> None:
         with self.locked():
-            # Others may have appended some since.
+            # Others may have appended lines since the last read.
             total = [self._read, *(position for _, position in self._lines())][-1].sum
             lines = []
             for operation in logs:
@@ -131,21 +131,21 @@ class JournalFile(BaseJournalBackend):
                     file.flush()
                     os.fsync(file.fileno())
             except OSError:
-                # Some lines may be there on a full disk, and all are written again.
+                # On a full disk some lines may have been written: remove them, because all are written again.
                 os.truncate(self._path, end)
                 raise
 
     def _lines(self) -> Iterator[tuple[bytes, Position]]:
-        """Iterate over the whole lines that have not been read, each with the position behind it."""
+        """Iterate over the complete lines that have not been read, each with the position after it."""
         position = self._read
         with self._path.open("rb") as file:
             if file.seek(0, os.SEEK_END) < position.end:
                 raise self._damaged(position.n_lines)
             file.seek(position.end)
-            # At once: a torn line may be replaced meanwhile.
+            # All at once: a torn line may be replaced meanwhile.
             unread = file.read()
         for line in io.BytesIO(unread):
-            # Somebody is writing it, or died over it.
+            # Its writer has not finished it, or has died.
             if not line.endswith(b"\n"):
                 return
             told = SUM.search(line)
@@ -156,8 +156,8 @@ class JournalFile(BaseJournalBackend):
             yield line, position
 
     def _check_references(self, operation: dict[str, Any], number: int) -> None:
-        """Raise `StudyError` if an operation is on a study or a trial that no line before it has made."""
-        # Some of these lines may have made none, because two workers wrote them at once.
+        """Raise `StudyError` if an operation refers to a study or a trial that no line before it created."""
+        # Upper bounds: some lines create nothing, because two workers wrote them at once.
         self._n_studies += operation["op_code"] == JournalOperation.CREATE_STUDY
         is_known = operation.get("study_id", -1) < self._n_studies and operation.get("trial_id", -1) < self._n_trials
         self._n_trials += operation["op_code"] == JournalOperation.CREATE_TRIAL

@@ -7,15 +7,15 @@ from collections.abc import Sequence
 from optuna.storages import BaseStorage
 from optuna.trial import FrozenTrial
 
-# Begins the names of the system attributes that hold the reports of several objectives; the step follows.
+# Prefix of the system attributes that hold the reports of several objectives; the step follows.
 REPORT = "report:"
 
 
 def keep_report(storage: BaseStorage, trial_id: int, step: int, values: Sequence[float]) -> None:
-    """Keep a report in the storage.
+    """Store a report.
 
-    One value is kept as Optuna keeps it. Optuna keeps no reports of several objectives, and its samplers refuse
-    intermediate values in such a study: these reports are system attributes.
+    A single value is stored as Optuna's intermediate value. Optuna supports no reports of several objectives, and its
+    samplers refuse intermediate values in such a study, so these reports are system attributes.
 
     Args:
         storage: Storage of the study.
@@ -30,7 +30,7 @@ def keep_report(storage: BaseStorage, trial_id: int, step: int, values: Sequence
 
 
 def reports_of(trial: FrozenTrial) -> dict[int, tuple[float, ...]]:
-    """Return the values of the objectives by the steps at which a trial has reported them, in the order of steps."""
+    """Return a trial's reports: the values of the objectives by step, in the order of steps."""
     reports = {step: (value,) for step, value in trial.intermediate_values.items()}
     for name, values in trial.system_attrs.items():
         if name.startswith(REPORT):

@@ -23,7 +23,7 @@ from armscan.utils.files import SQLITE_PREFIX, sqlite_file
 
 T = TypeVar("T")
 MAX_REASON_CHARS = 300
-# Some of Optuna's.
+# Some of Optuna's tables.
 TABLES = {"studies", "trials", "version_info"}
 
 
@@ -54,8 +54,8 @@ class Storage:
         """Run an operation that excludes all other processes, and return its result.
 
         Args:
-            decide: Short, because the others wait. If the storage becomes unavailable in the middle, it is called again
-                when the storage is back: then all of its writes are there, or none.
+            decide: Short operation, because the others wait. If a PostgreSQL database becomes unavailable midway, it is
+                called again once the database is back: then all of its writes are there, or none.
         """
         if self.lock_file is None:
             assert isinstance(self.optuna, DatabaseStorage)
@@ -64,10 +64,10 @@ class Storage:
             return decide()
 
     def transaction(self, operate: Callable[[], T]) -> T:
-        """Run several reads and writes in one round trip to a PostgreSQL database, and return their result.
+        """Run several reads and writes, in one transaction of a PostgreSQL database, and return their result.
 
         Args:
-            operate: Function that reads and writes; it may be called again, as `decide` of `exclusive`.
+            operate: Function that reads and writes; it may be called again, like `decide` of `exclusive`.
         """
         if self.lock_file is None:
             assert isinstance(self.optuna, DatabaseStorage)
@@ -81,7 +81,8 @@ def open_storage(uri: str, *, where: str = "study.storage", retry: bool = False)
     Args:
         uri: Path of a journal file, `sqlite:///FILE`, or the URL of a PostgreSQL database.
         where: Key that named the storage, for messages.
-        retry: Whether to wait for an unavailable database while opening it; an open one is always waited for.
+        retry: Whether to wait for an unavailable PostgreSQL database while opening it; calls to an open one are always
+            retried. Default: False.
 
     Raises:
         StudyError: If it cannot be reached or used.
@@ -92,9 +93,9 @@ def open_storage(uri: str, *, where: str = "study.storage", retry: bool = False)
             return Storage(uri, open_database(uri, retry=retry), None)
         file.parent.mkdir(parents=True, exist_ok=True)
         _is_there(file)
-        # A lock that cannot be made would be waited for for ever.
+        # Fail now if the lock file cannot be created: the lock would wait forever.
         _lock_file_of(file).touch()
-        # Processes that make the tables of a fresh file at once get into each other's way.
+        # Processes that create the tables of a new file at the same time would conflict.
         with FileLock(_lock_file_of(file)):
             return _in_file(uri, file, is_written=True)
 
@@ -120,7 +121,7 @@ def _lock_file_of(file: Path) -> Path:
 
 
 def _is_there(file: Path) -> bool:
-    """Return whether there is a file; raise `OSError` if none can be."""
+    """Return whether there is a file; raise `OSError` if there is something else."""
     try:
         if stat.S_ISREG(file.stat().st_mode):
             return True
@@ -144,7 +145,7 @@ def _tables(uri: str) -> set[str]:
 
 @contextlib.contextmanager
 def _refused_in_one_line(uri: str, where: str) -> Iterator[None]:
-    """Turn the errors of an unusable storage into one line."""
+    """Turn the errors of an unusable storage into a one-line `StudyError`."""
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     check_address(where, uri)
     if "://" in uri and not uri.startswith((SQLITE_PREFIX, "postgresql")):

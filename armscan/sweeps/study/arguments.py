@@ -24,7 +24,7 @@ STUDY = "study"
 TASK_TARGET, TRAINING_TASK = "study.task._target_", "armscan.sweeps.tasks.training.TrainingTask"
 USUAL_LAUNCHER = "submitit_local"
 WORKER_KEY, SPACE, STORAGE, SEARCH_PATH = "study.worker", "study.space", "study.storage", "hydra.searchpath"
-# Of one key: where the range begins, say, or all of it.
+# An override of the space, of one of its keys, or of a part of a key, such as the lower end of its range.
 SPACE_OVERRIDE = re.compile(r"\+*study\.space(?:\.(.+?)(?:\.(low|high|log|step|choices|when))?)?=(.*)", re.DOTALL)
 NO_RANGE = ",low:null,high:null,log:null,step:null"
 
@@ -63,19 +63,19 @@ class StudyCommand:
 
 
 def trial_overrides(overrides: Sequence[str]) -> list[str]:
-    """Return the overrides that the configuration of a trial is composed of.
+    """Return the overrides that the configuration of a trial is composed from.
 
-    Those of Hydra itself are for the launching of workers, but for the one that says where configurations are found.
+    Overrides of Hydra itself only concern the launch of workers, except for the search path.
     """
     others = ("hydra", f"{WORKER_KEY}=")
     return [each for each in overrides if not each.lstrip("+~").startswith(others) or each.startswith(SEARCH_PATH)]
 
 
 def check_training_overrides(arguments: Sequence[str]) -> None:
-    """Check the configuration of a study's trainings as that of a run, before Optuna is loaded.
+    """Check the configuration of a study's trainings like a run's, before Optuna is loaded.
 
     Args:
-        arguments: Arguments of the command line. Those of a study with another task than training are left to its task.
+        arguments: Arguments of the command line; those of a study whose task is not training are left to its task.
 
     Raises:
         InvalidValueError: If a value is not allowed.
@@ -91,13 +91,13 @@ def fixed_by(overrides: Sequence[str]) -> dict[str, Any]:
 
 
 def _merging(override: str) -> str:
-    """Return an override; one that changes the study's space is rewritten, so that Hydra changes it key by key."""
+    """Return an override; one that changes the study's space is rewritten, so that Hydra merges it key by key."""
     given = SPACE_OVERRIDE.fullmatch(override)
     if given is None:
         return override
     key, part, value = given.groups()
     if part:
-        # Choices stand in the place of a range.
+        # Choices replace a range.
         value = f"{{{part}:{value}{NO_RANGE if part == 'choices' else ''}}}"
     return f"++{SPACE}={{{key}:{value}}}" if key else f"++{SPACE}={value}"
 

@@ -47,12 +47,12 @@ def read_settings(overrides: Sequence[str]) -> tuple[StudySettings, Task, DictCo
     if not section:
         raise InvalidValueError("there is no study in the configuration: give sweep=NAME of a file with one")
     if "space" in section:
-        # What is given a value is not searched.
+        # A key that is given a value is not searched.
         section["space"] = Space.read(section["space"]).without(fixed_by(overrides))
         if not section["space"].parameters:
             raise InvalidValueError("nothing is left to search: each key of study.space is given a value")
     settings = StudySettings.read("study", section)
-    # What cannot be made is refused here, and not by the first trial.
+    # A component that cannot be instantiated is refused here, and not by the first trial.
     sampler = make("sampler", settings.sampler, BaseSampler, seed=settings.seed)
     if isinstance(sampler, optuna.samplers.CmaEsSampler) and not isinstance(sampler, CmaEsSampler):
         raise InvalidValueError(
@@ -82,7 +82,7 @@ def read_settings(overrides: Sequence[str]) -> tuple[StudySettings, Task, DictCo
 
 
 def make(name: str, described: Mapping[str, Any], kind: type[Any], **arguments: Any) -> Any:
-    """Return the object of this class that `study.NAME` describes; raise `InvalidValueError` if it describes none."""
+    """Return the object of class `kind` that `study.NAME` describes; raise `InvalidValueError` if there is none."""
     try:
         made = instantiate(described, **arguments)
     except InstantiationException as error:
@@ -104,9 +104,9 @@ def make_terminator(settings: StudySettings) -> Terminator:
 
 
 def check_space(settings: StudySettings, task: Task, overrides: Sequence[str], config: DictConfig) -> None:
-    """Build the experiment without the space, then with each choice and both ends of each range.
+    """Check the configuration without the space, then with each choice and both ends of each range.
 
-    Choices of groups and of keys at the top are tried beside values of all others, too, as a trial has them.
+    Choices of groups and of top-level keys are also checked with values of all other parameters, as in a trial.
 
     Args:
         settings: Settings of the study.
@@ -118,10 +118,10 @@ def check_space(settings: StudySettings, task: Task, overrides: Sequence[str], c
         InvalidValueError: If a key is unknown, or a value not allowed.
     """
     tried = list(settings.space.extremes())
-    # Of groups, or at the top: what the last of the values changes may leave no place for another.
+    # Groups and top-level keys: another choice may remove keys that other parameters set.
     whole = [chosen for chosen in tried if "." not in list(chosen)[-1]]
     for chosen in whole:
-        # Before an agent is built, because the first of a process compiles for many seconds.
+        # Before an agent is built, because the first agent of a process compiles for many seconds.
         with _named(chosen):
             compose_run([*overrides, *overrides_of(chosen)])
     task.check(config)
@@ -132,7 +132,7 @@ def check_space(settings: StudySettings, task: Task, overrides: Sequence[str], c
 
 @contextmanager
 def _named(chosen: Mapping[str, Value]) -> Iterator[None]:
-    """Name the values in an error that are not allowed."""
+    """Name the tried values in the error that they lead to."""
     try:
         yield
     except (ArmscanError, HydraException, OmegaConfBaseException, ValueError) as error:

@@ -25,7 +25,7 @@ class Constraint:
     Args:
         metric: Name of the metric.
         is_upper: Whether the bound is the largest allowed value, instead of the smallest.
-        bound: Allowed limit; a value equal to it is allowed.
+        bound: The bound, which is itself allowed.
     """
 
     metric: str
@@ -37,7 +37,7 @@ class Constraint:
         """Return the constraint of a string such as `training_s <= 60`.
 
         Raises:
-            InvalidValueError: If the text is none.
+            InvalidValueError: If the text is not a constraint.
         """
         found = CONSTRAINT.fullmatch(text) if isinstance(text, str) else None
         try:
@@ -55,9 +55,9 @@ class Constraint:
         return f"{self.metric} {'<=' if self.is_upper else '>='} {self.bound:g}"
 
     def violation(self, metrics: Mapping[str, float]) -> float:
-        """Return by how much metrics violate it, as a share of the bound: at most 0 if they do not.
+        """Return by how much metrics violate it, relative to the bound: at most 0 if they do not.
 
-        As a share, because Optuna's samplers add up the violations of all constraints. A metric that is no number
+        Relative, because Optuna's samplers add up the violations of all constraints. A metric that is missing or NaN
         violates it infinitely.
         """
         value = metrics.get(self.metric, math.nan)
@@ -85,7 +85,7 @@ def constrained(run: Run, constraints: Sequence[Constraint]) -> Run:
 
 
 def _keep(trial: Trial, violations: Mapping[str, float]) -> None:
-    # A new object: what the trial believes written may have been lost with the connection.
+    # A new object: writes that the trial has cached may have been lost with the connection.
     again = Trial(trial.study, trial._trial_id)
     for name in violations.keys() - again.constraints.keys():
         again.set_constraint(name, violations[name])

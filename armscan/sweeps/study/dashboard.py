@@ -18,7 +18,7 @@ from armscan.utils.files import sha256
 from armscan.utils.log import log
 from armscan.utils.markdown import markdown_table
 
-# Where `armscan ui` serves the runs of a store that is no server, but where it was given another port.
+# Where `armscan ui` serves the runs of a local store, unless it is given another port.
 LOCAL_UI = f"http://127.0.0.1:{MLFLOW_PORT}"
 
 
@@ -30,17 +30,17 @@ def note_run(
     folder: Path,
     figures: str = "",
 ) -> None:
-    """Leave a note with the link to the tracked run of a study or a trial, its folder, and its figures.
+    """Write the note of a study or a trial: a link to its tracked run, its folder, and its metrics.
 
-    A note of a study that a person has edited stays as it is.
+    A study's note that a person has edited stays as it is.
 
     Args:
-        target: Study or trial to note it at.
+        target: Study or trial that gets the note.
         client: Client of the tracking store.
         experiment_id: MLflow experiment ID of the run.
         run_id: MLflow run ID.
         folder: The folder of the study or the trial.
-        figures: Figures in Markdown. Default: "", none.
+        figures: Metrics in Markdown. Default: "", none.
     """
     # Deferred: it takes a second, and only workers and launchers need it.
     from optuna_dashboard import get_note, save_note
@@ -72,8 +72,8 @@ def shown_metrics(metrics: Mapping[str, float], n_seeds: int) -> dict[str, float
     """Return the leading metrics of a trial, rounded and by their titles, as user attributes.
 
     Args:
-        metrics: Metrics by name; of a final training, those of the test are shown.
-        n_seeds: Number of seeds of their interquartile means.
+        metrics: Metrics by name; of a final training on the test volumes, only the metrics there are shown.
+        n_seeds: Number of seeds that their interquartile means are over.
     """
     tested = metrics_of_test(metrics)
     of, statistic = "test volumes: " if tested else "", f" (IQM of {n_seeds} seeds)" if n_seeds > 1 else ""
@@ -83,14 +83,14 @@ def shown_metrics(metrics: Mapping[str, float], n_seeds: int) -> dict[str, float
 
 
 def named_as_of_runs(metrics: Mapping[str, float]) -> dict[str, float]:
-    """Return the leading metrics of a trial by the names that runs use, so that MLflow has them in the same columns."""
+    """Return a trial's leading metrics by the names that runs use, so that MLflow shows them in the same columns."""
     tested = metrics_of_test(metrics)
     of_phases = {"validation": metrics, "test_volumes": tested}
     return {f"{of}/{name}": each[name] for of, each in of_phases.items() for name in leading_among(each)}
 
 
 def show_picture(trial: Trial, picture: Path, artifacts: Path) -> None:
-    """Copy a picture to where the dashboard finds those of a trial."""
+    """Store a picture where the dashboard finds those of a trial."""
     # Deferred: it loads boto3 if that is installed.
     from optuna.artifacts import FileSystemArtifactStore, upload_artifact
 
@@ -98,5 +98,5 @@ def show_picture(trial: Trial, picture: Path, artifacts: Path) -> None:
         artifacts.mkdir(parents=True, exist_ok=True)
         upload_artifact(study_or_trial=trial, file_path=str(picture), artifact_store=FileSystemArtifactStore(artifacts))
     except OSError as error:
-        # No reason for a trial to fail: it is in its folder, too.
+        # No reason for a trial to fail: the picture is in its folder, too.
         log(f"{picture} cannot be shown in Optuna's dashboard: {error}")

@@ -1,7 +1,7 @@
 """The final evaluation of a study: which trainings are missing, which configuration is selected, which seeds judge it.
 
-All of it is read from the storage. The candidates race on the validation volumes; the test volumes are opened for the
-chosen one and the control alone, with other seeds.
+All of it is derived from the storage. The candidates race on the validation volumes; only the chosen one and the
+control are evaluated on the test volumes, with other seeds.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ from armscan.utils.section import Section
 
 # User attribute of the study of the selection: its settings, for reports.
 FINAL_EVAL = "final_eval"
-# What the control is.
+# Description of the control.
 NOTHING_SEARCHED = "the configuration of the study without what it searches"
 ENDED_WITHOUT_SCORE = (TrialState.FAIL, TrialState.PRUNED)
 
 
 class _Stored(Section):
-    """Settings of a final evaluation, as the study of the selection keeps them; see `FinalEvaluation`."""
+    """Settings of a final evaluation, as the study of the selection stores them; see `FinalEvaluation`."""
 
     settings: FinalEvalSettings = Field(description="a section with top_k, min_seeds, mean_seeds and judge_seeds")
     search_seed: int = Field(ge=0, le=MAX_SEARCH_SEED, description="the largest seed of the search")
@@ -74,7 +74,7 @@ class FinalEvaluation:
     def opened(
         cls, storage: Storage, settings: StudySettings, search: optuna.Study, control: Mapping[str, Value] | None
     ) -> Self:
-        """Make the two studies, or find them.
+        """Create the two studies, or load them.
 
         Args:
             storage: Storage of the study.
@@ -126,7 +126,7 @@ class FinalEvaluation:
 
     @property
     def selection_seeds(self) -> range:
-        """The seeds of the selection, as many as one configuration may get; no search trial was run with one."""
+        """The seeds of the selection, as many as one configuration may get; the search has not used one."""
         first = self.search_seed + SELECTION_SEEDS_ABOVE
         return range(first, first + MAX_SEEDS_FACTOR * self.settings.mean_seeds)
 
@@ -144,13 +144,13 @@ class FinalEvaluation:
     def candidates(self) -> list[int]:
         """Return the control and the numbers of the best trials; nothing if no trial has finished."""
         best = best_trials(self.search, self.settings.top_k + 1)
-        # A trial with the values of the control is the control, also of another study or preset.
+        # A trial with the values of the control is the control, even if taken from another study or a preset.
         others = [trial.number for trial in best if renamed(searched_values(trial)) != self.control]
-        # First, so that it wins where it is as good.
+        # First, so that the control wins a tie.
         return [CONTROL, *others[: self.settings.top_k]] if best and self.settings.top_k else []
 
     def scores(self) -> dict[int, dict[int, float]]:
-        """Return the score of each training of the selection that has ended, by candidate and seed; NaN: it failed."""
+        """Return the score of each ended training of the selection, by candidate and seed; NaN if it failed."""
         scores: dict[int, dict[int, float]] = {number: {} for number in self.candidates()}
         for trial in self.selection.get_trials(deepcopy=False):
             number, seed = training_of(trial)
@@ -166,7 +166,7 @@ class FinalEvaluation:
         """Return the state of the selection's race.
 
         Args:
-            scores: What `scores` has returned. Default: None, the scores of now.
+            scores: Result of `scores`. Default: None, the current scores.
         """
         scores, settings = self.scores() if scores is None else scores, self.settings
         return race(scores, self.selection_seeds, min_seeds=settings.min_seeds, mean_seeds=settings.mean_seeds)
@@ -199,7 +199,7 @@ class FinalEvaluation:
 
 
 def to_judge(race: Race) -> list[int]:
-    """Return the configurations that the test volumes are opened for: the chosen one and the control.
+    """Return the configurations to evaluate on the test volumes: the chosen one and the control.
 
     The control alone while the race continues; none if nothing was chosen.
     """
@@ -214,7 +214,7 @@ def training_of(trial: FrozenTrial | Trial) -> tuple[int, int]:
 
 
 def name_of(number: int) -> str:
-    """Return the name of a configuration for people: `control`, or `trial 7`."""
+    """Return the name of a configuration for users: `control`, or `trial 7`."""
     return "control" if number == CONTROL else f"trial {number}"
 
 
@@ -228,7 +228,7 @@ def settings_of(searched: Sequence[FrozenTrial], number: int) -> dict[str, Any]:
 
     Args:
         searched: Trials of the search.
-        number: Number of one of them, or that of the control.
+        number: Number of one of them, or `CONTROL`.
     """
     return {} if number == CONTROL else renamed(searched_values(searched[number]))
 
@@ -239,9 +239,9 @@ def _attributes(searched: Sequence[FrozenTrial], number: int, seed: int) -> dict
 
 
 def n_trainings(settings: FinalEvalSettings) -> tuple[int, int]:
-    """Return a lower and an upper bound of the trainings of a final evaluation in which none fails.
+    """Return a lower and an upper bound on the number of trainings of a final evaluation in which none fails.
 
-    The lower bound: the control leads far ahead as soon as it has enough seeds.
+    The lower bound assumes that the control is far ahead as soon as it has enough seeds.
     """
     if not settings.top_k:
         return 0, 0

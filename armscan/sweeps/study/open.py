@@ -1,4 +1,4 @@
-"""A study as its workers and its launcher see it, from the same overrides."""
+"""Open a study from its overrides, in the same way for its workers and its launcher."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ NO_END = 10**9
 def open_for_work(
     settings: StudySettings, task: Task, config: DictConfig, overrides: Sequence[str], *, retry: bool = False
 ) -> OpenedStudy:
-    """Open a study, and make it if there is none.
+    """Open a study, and create it if there is none.
 
     Args:
         settings: Settings of the study, as `read_settings` returns them.
@@ -92,7 +92,7 @@ def _tracked_run(
     folder: Path,
     overrides: Sequence[str],
 ) -> str:
-    """Return the ID of a study's own run in MLflow, which is made if the study has none yet."""
+    """Return the ID of a study's own run in MLflow; create the run if the study has none yet."""
     name = study.study_name
 
     @functools.cache

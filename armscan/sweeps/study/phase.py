@@ -39,7 +39,7 @@ class Phase:
         run: Function that runs an attempt at a trial and returns its metrics.
         seeds_of: Function that returns the training seeds of a trial.
         sampler: Sampler; see `StudySettings`.
-        seed: Seed of the samplers, beside a trial's number.
+        seed: Seed of the samplers, combined with a trial's number.
         folder: Folder of its study.
         artifacts: Folder of the plots; see `StudySettings`.
         client: Client of the tracking store.
@@ -65,9 +65,9 @@ class Phase:
     population: Population | None = None
 
     def remove_checkpoints(self, finished: Trial) -> None:
-        """Remove the last checkpoints of a trial that has finished; the best ones stay.
+        """Remove the last checkpoints of a finished trial; the best ones stay.
 
-        Of a population's trials those from which no member can continue any more.
+        In a population, remove the last checkpoints of all trials from which no member can continue any more.
         """
         numbers = {finished.number}
         if self.population is not None:
@@ -78,7 +78,7 @@ class Phase:
                 file.unlink(missing_ok=True)
 
     def tags_of(self, trial: FrozenTrial | Trial) -> dict[str, str]:
-        """Return the tags by which tracked runs of a trial are known."""
+        """Return the tags that identify the tracked runs of a trial."""
         return {STUDY_TAG: self.name, STORAGE_TAG: self.scheduler.storage.uri, TRIAL_TAG: str(trial.number)}
 
     def suggest(self, trial: Trial) -> dict[str, Value]:
@@ -86,7 +86,7 @@ class Phase:
         if trial.user_attrs.get(FINALIST) == CONTROL:
             return {}
         chosen = self.space.suggest(trial)
-        # Of a member of a population, also what has changed since its beginning.
+        # A member of a population also has the changes since its beginning.
         return searched_values(trial) if SCHEDULE in trial.user_attrs else chosen
 
     def close_runs_of(self, trial: FrozenTrial) -> None:
@@ -94,7 +94,7 @@ class Phase:
         abandon(trial_folder(self.folder, trial.number), self.client, WORKER_DIED)
 
     def close_orphaned_runs(self) -> None:
-        """Close runs whose workers ended before the trial, or the folder of a seed, knew the run's ID."""
+        """Close runs whose workers ended before the run's ID was stored in the trial or in the folder of a seed."""
         # Read first: the runs of a trial that finishes meanwhile are closed by its worker.
         finished = self.scheduler.state().finished
         running = self.client.runs(

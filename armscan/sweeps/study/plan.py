@@ -38,7 +38,7 @@ def print_plan(
         settings: Settings of the study.
         study: Study of the search; None if it has not been started.
         final: Its final evaluation; None if it has not been started.
-        initial: Trials that come first.
+        initial: Initial trials of the study.
     """
     console = wide_console(WHOLE_CHARS)
     state = StudyState.of(study.get_trials(deepcopy=False) if study is not None else ())
@@ -77,7 +77,7 @@ def print_plan(
 def _print_cost(
     console: Console, settings: StudySettings, state: StudyState, final: FinalEvaluation | None, *, n_left: int
 ) -> None:
-    """Print the cost of the finished trials, and that of `n_left` trials and the final evaluation."""
+    """Print the cost of the finished trials, and an estimate for `n_left` trials and the final evaluation."""
     timed = [(trial, trial.duration.total_seconds()) for trial in state.finished if trial.duration is not None]
     seconds = [spent_s for _, spent_s in timed]
     mean_s = fmean(seconds)
@@ -97,7 +97,7 @@ def _print_cost(
 
 
 def _size_bytes(path: Path) -> int:
-    """Return the size of a file; 0 of a folder, and of a file that a worker has just replaced or deleted."""
+    """Return the size of a file; 0 for a folder, and for a file that a worker has just replaced or deleted."""
     try:
         stat = path.lstat()
     except OSError:
@@ -108,10 +108,10 @@ def _size_bytes(path: Path) -> int:
 def hours_left(
     settings: StudySettings, final: FinalEvaluation | None, *, n_left: int, trial_s: float, training_s: float
 ) -> tuple[float, float]:
-    """Return a lower and an upper bound of the hours that a study takes to its end, if no trial fails.
+    """Return a lower and an upper bound on the hours until a study ends, if no trial fails.
 
-    The lower bound: no worker ever waits. The upper bound: all final trainings are as few at a time as those of the
-    race's rounds.
+    For the lower bound no worker ever waits; for the upper bound no more final trainings run at a time than one round
+    of the race has.
 
     Args:
         settings: Settings of the study.
@@ -128,7 +128,7 @@ def hours_left(
 
 
 def final_trainings_left(settings: StudySettings, final: FinalEvaluation | None, *, n_left: int) -> tuple[int, int]:
-    """Return a lower and an upper bound of the final trainings that are left.
+    """Return a lower and an upper bound on the number of final trainings that are left.
 
     Args:
         settings: Settings of the study, which may have changed since the final evaluation was begun.

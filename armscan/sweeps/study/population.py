@@ -26,7 +26,7 @@ def population_of(settings: StudySettings, config: DictConfig) -> Population | N
         config: Configuration of its trials, without the searched values.
 
     Raises:
-        InvalidValueError: If the study asks for what a population cannot do.
+        InvalidValueError: If the study has a setting that a population does not support.
     """
     sampler = make("sampler", settings.sampler, BaseSampler, seed=settings.seed)
     if not isinstance(sampler, PopulationSampler):
@@ -72,7 +72,7 @@ def _check(settings: StudySettings, config: DictConfig, sampler: PopulationSampl
 
 
 def _check_interval(config: DictConfig, interval: int) -> None:
-    """Raise `InvalidValueError` if generations do not divide the training, or one of them could be without an epoch."""
+    """Raise `InvalidValueError` if generations do not divide the training, or one of them could have no epoch."""
     total, epoch = config.training.env_steps, config.training.eval_every_env_steps
     name = "study.sampler.interval_env_steps"
     if total % interval or total == interval:
@@ -80,7 +80,7 @@ def _check_interval(config: DictConfig, interval: int) -> None:
             f"{name} is {interval}, but it must divide training.env_steps = {total} into two generations or more"
         )
     agent: Any = config.agent
-    # What is taken before the first epoch, and at once, is rounded up.
+    # An epoch has whole collections, and the first one also the steps before learning starts.
     epoch = max(epoch, agent.get("env_steps_per_collection", 1))
     first = agent.get("learning_starts", 0) + epoch
     if interval < epoch or 2 * interval <= first:

@@ -18,15 +18,15 @@ Losses = NDArray[np.float64]
 class ParetoPruner(BasePruner):
     """Asynchronous successive halving by Pareto fronts.
 
-    The rungs are `min_resource` steps and each `reduction_factor` times as many as the one before. A trial that reaches
-    a rung is compared with all trials that have reached it, and with those that ended before it by their final values.
-    It continues if fewer are better than may continue: one in `reduction_factor`, at least one. Better is a lower
-    Pareto front, and within one the larger crowding distance (Schmucker et al. 2021, arXiv:2106.12639; Deb et al. 2002,
-    doi:10.1109/4235.996017). The first front always continues, however many it has.
+    The first rung is at `min_resource` steps, and each further one at `reduction_factor` times as many. A trial that
+    reaches a rung is compared with all trials that have reached it, and with the final values of those that completed
+    before it. One trial in `reduction_factor` may continue, at least one: a trial is pruned if so many are better.
+    Trials are ranked by Pareto front, and within a front by crowding distance, the larger the better (Schmucker et al.
+    2021, arXiv:2106.12639; Deb et al. 2002, doi:10.1109/4235.996017). The whole first front always continues.
 
     Args:
         min_resource: Environment steps of the first rung, 1 or more.
-        reduction_factor: Factor of reduction, 2 or more: one trial in so many continues from a rung. Default: 3.
+        reduction_factor: Reduction factor, 2 or more: one trial in so many continues from a rung. Default: 3.
 
     Raises:
         InvalidValueError: If a number is too small.
@@ -37,7 +37,7 @@ class ParetoPruner(BasePruner):
         self._reduction_factor = check_int("reduction_factor", reduction_factor, at_least=2)
 
     def prune(self, study: optuna.Study, trial: FrozenTrial) -> bool:
-        """Return whether a trial is to be pruned, which it is at its first report on a rung at most."""
+        """Return whether to prune a trial, which is possible only at its first report on a rung."""
         steps = list(reports_of(trial))
         rung = self._rung_below(steps[-1]) if steps else None
         if rung is None or any(step >= rung for step in steps[:-1]):
@@ -45,7 +45,7 @@ class ParetoPruner(BasePruner):
         reached = [_values_at(rung, each) for each in study.get_trials(deepcopy=False) if each.number != trial.number]
         values = [_values_at(rung, trial), *filter(None, reached)]
         losses = np.array(values, dtype=float) * loss_signs(study.directions)
-        # What is not known counts as worst.
+        # An unknown value counts as worst.
         losses = np.nan_to_num(losses, nan=np.inf, posinf=np.inf, neginf=-np.inf)
         return bool(n_better(losses) >= max(1, len(losses) // self._reduction_factor))
 
@@ -60,7 +60,7 @@ class ParetoPruner(BasePruner):
 
 
 def _values_at(rung: int, trial: FrozenTrial) -> tuple[float, ...] | None:
-    """Return the values of a trial at a rung, its final ones if it ended before; None if it has not come so far."""
+    """Return the values of a trial at a rung, or its final ones if it completed before it; None if it has neither."""
     at_rung = next((values for step, values in reports_of(trial).items() if step >= rung), None)
     if at_rung is None and trial.state == TrialState.COMPLETE:
         return tuple(trial.values)
@@ -68,7 +68,7 @@ def _values_at(rung: int, trial: FrozenTrial) -> tuple[float, ...] | None:
 
 
 def n_better(losses: Losses) -> int:
-    """Return how many trials are better than the first: none if it is on the first front.
+    """Return how many trials are better than the first one: 0 if it is on the first front.
 
     Args:
         losses: Losses, shape (trials, objectives); lower is better.
@@ -107,7 +107,7 @@ def crowding_distances(losses: Losses) -> Losses:
     for values in losses.T:
         order = np.argsort(values, kind="stable")
         ordered = values[order]
-        # Of objectives that are the same everywhere, or not known of some, there is none.
+        # An objective that is constant, or unknown for some trial, adds nothing.
         if np.isfinite(ordered[[0, -1]]).all() and ordered[0] < ordered[-1]:
             inner = (ordered[2:] - ordered[:-2]) / (ordered[-1] - ordered[0])
             distances[order] += np.concatenate([[np.inf], inner, [np.inf]])

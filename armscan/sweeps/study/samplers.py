@@ -1,4 +1,4 @@
-"""Samplers that take nothing but numbers from a storage, to which a stranger may have written."""
+"""Samplers that read only numbers from a storage, to which a stranger may have written."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from optuna.trial import FrozenTrial
 
 from armscan.errors import StudyError
 
-# Classes of the state of CMA-ES, and what else is pickled with it, by module; none of it executes anything.
+# Classes of the state of CMA-ES, and the other names pickled with it by module; none of them executes anything.
 STATES = {"CMA": "cmaes._cma", "SepCMA": "cmaes._sepcma", "CMAwM": "cmaes._cmawm"}
 PICKLED = {
     **{module: {name} for name, module in STATES.items()},
@@ -46,7 +46,7 @@ class CmaEsSampler(optuna.samplers.CmaEsSampler):
 
 
 class _Numbers(pickle.Unpickler):
-    """Reads pickles of numbers, and refuses any other before it is built."""
+    """Unpickler of numbers, which refuses any other object before it is built."""
 
     def find_class(self, module: str, name: str) -> Any:
         """See `pickle.Unpickler`."""

@@ -20,7 +20,7 @@ from armscan.utils.section import Section
 from armscan.utils.validation import MAX_SEED
 
 NAME = re.compile(rf"(?!.*(?:{'|'.join(FINAL_SUFFIXES)})$)\w[\w\-.]{{0,99}}")
-# So much above the largest seed of the search are the first seed of the selection, and that of the judgement.
+# Distance of the first selection seed and the first judgement seed from the largest search seed; most final seeds.
 SELECTION_SEEDS_ABOVE, JUDGEMENT_SEEDS_ABOVE, MAX_FINAL_SEEDS = 1000, 2000, 1000
 MAX_SEARCH_SEED = MAX_SEED - JUDGEMENT_SEEDS_ABOVE - MAX_FINAL_SEEDS
 T = TypeVar("T")
@@ -29,7 +29,7 @@ NO_PRUNER = f"{OPTUNA_PRUNERS}NopPruner"
 
 
 def check_study_name(where: str, name: Any) -> str:
-    """Return the name of a study, if it is one."""
+    """Return the name of a study; raise `InvalidValueError` if it is not a valid one."""
     if not isinstance(name, str) or not NAME.fullmatch(name):
         raise InvalidValueError(
             f"{where} is {name!r}, but it must begin with a letter, a digit or _, go on with these, - and ., have at "
@@ -38,7 +38,7 @@ def check_study_name(where: str, name: Any) -> str:
     return name
 
 
-# A validator that says nothing leaves it to the description of the field.
+# A validator that raises without a message leaves the message to the description of the field.
 def _target(described: Mapping[str, Any]) -> Mapping[str, Any]:
     if "." not in str(described.get("_target_")):
         raise ValueError
@@ -65,7 +65,7 @@ def _without_repetition(given: tuple[T, ...]) -> tuple[T, ...]:
 
 Name = Annotated[str, BeforeValidator(lambda name: check_study_name("study.name", name))]
 Other = Annotated[str, BeforeValidator(lambda name: check_study_name("study.warm_start", name))]
-# Not blank, and without what no path can have.
+# Not blank, and without null characters, which no path can have.
 Place = Annotated[str, Field(pattern=r"^[^\x00]*[^\s\x00][^\x00]*$", description="a string that says where")]
 Target = Annotated[
     Mapping[str, Any], AfterValidator(_target), Field(description="a section with a _target_, the name of a class")
@@ -83,19 +83,20 @@ MeanSeeds = Annotated[int, Field(ge=1, le=MAX_MEAN_SEEDS, description=f"a whole 
 
 
 class FinalEvalSettings(Section):
-    """The final evaluation: one of the best configurations is selected, and judged beside the control.
+    """Settings of the final evaluation, which selects one of the best configurations and compares it with the control.
 
-    The control is the configuration of the study without what it searches. No search trial was run with any of the
-    seeds, and the judgement has seeds of its own.
+    The control is the configuration of the study without the searched values. The search uses none of the seeds, and
+    the judgement has seeds of its own.
 
     Args:
         top_k: Number of candidates, the best different configurations of the search, 0 or more; 0 for no final
             evaluation.
-        min_seeds: Seeds of each candidate, and of the control, in the first round of the selection, from 1 to
+        min_seeds: Number of seeds of each candidate, and of the control, in the first round of the selection, from 1 to
             `mean_seeds`.
-        mean_seeds: Seeds of each on average in the whole selection, at most, from 1 to 250; those that may be the best
-            get more than others, and none more than four times as many.
-        judge_seeds: Seeds of the chosen configuration, and of the control, on the test volumes, from 1 to 1000.
+        mean_seeds: Maximum number of seeds of each on average in the whole selection, from 1 to 250; those that may be
+            the best get more than others, but at most four times this number.
+        judge_seeds: Number of seeds of the chosen configuration, and of the control, on the test volumes, from 1 to
+            1000.
     """
 
     top_k: int = Field(ge=0, description="a whole number of at least 0")
@@ -126,7 +127,7 @@ class StudySettings(Limits):
     """Settings of a study.
 
     Args:
-        name: Name of the study, in its storage and of its folder.
+        name: Name of the study in its storage, and of its folder.
         storage: Address of the storage; see `open_storage`.
         folder: Folder of the trials.
         artifacts: Folder of the plots for Optuna's dashboard.
@@ -182,7 +183,7 @@ class StudySettings(Limits):
     @model_validator(mode="after")
     def _can_prune(self) -> Self:
         target = self.pruner["_target_"]
-        # All of Optuna's compare one value.
+        # All pruners of Optuna compare one value.
         if len(self.objectives) > 1 and target.startswith(OPTUNA_PRUNERS) and target != NO_PRUNER:
             raise InvalidValueError(
                 f"study.pruner is {target}, which compares one objective, but study.objectives has "
@@ -192,12 +193,12 @@ class StudySettings(Limits):
 
     @property
     def asked(self) -> str:
-        """Return the trials asked for and the terminator as JSON; an ended study continues if they change."""
+        """Return the requested number of trials and the terminator as JSON; an ended study continues if they change."""
         terminator = dict(self.terminator) if self.terminator is not None else None
         return json.dumps({"n_trials": self.n_trials, "terminator": terminator}, sort_keys=True)
 
     def check_workers(self, n_cores: int) -> None:
-        """Raise `InvalidValueError` if the workers' compute threads are more than the cores of one machine."""
+        """Raise `InvalidValueError` if the workers have more compute threads than their machine has cores."""
         # OpenMP allows a number for each level of nesting.
         given = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0].strip() or "1"
         if not given.isdecimal() or int(given) < 1:

@@ -28,7 +28,7 @@ N_SHOWN = 5
 
 
 def make_study(storage: Storage, settings: StudySettings, fixed: Mapping[str, Any]) -> optuna.Study:
-    """Make a study, or find the existing one.
+    """Create a study, or load the existing one.
 
     Args:
         storage: Storage of the study.
@@ -66,13 +66,13 @@ def name_objectives(study: optuna.Study, names: Sequence[str]) -> None:
     """Name the objectives of a study for Optuna's dashboard, unless they have names; older studies have none."""
     if study.metric_names is None:
         with warnings.catch_warnings():
-            # Of a method that may change; optuna's range is pinned.
+            # The method may change, but Optuna's version range is pinned.
             warnings.simplefilter("ignore", ExperimentalWarning)
             study.set_metric_names(list(names))
 
 
 def existing_study(storage: Storage | None, settings: StudySettings, fixed: Mapping[str, Any]) -> optuna.Study | None:
-    """Return the study that these settings would continue with, to look at; None if they would begin one.
+    """Return the study that these settings would continue, for reading; None if they would begin a new one.
 
     Args:
         storage: Storage of the study; None if there is none yet.
@@ -89,7 +89,7 @@ def existing_study(storage: Storage | None, settings: StudySettings, fixed: Mapp
 
 
 def comparable_settings(settings: StudySettings, fixed: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what a study's storage keeps of its settings, to compare it with the same study started again."""
+    """Return the settings that a study stores, which are compared when it is started again."""
     of_trials: dict[str, Any] = {"study.seeds": list(settings.seeds), "study.task": settings.task["_target_"]}
     if settings.constraints:
         of_trials["study.constraints"] = list(map(str, settings.constraints))
@@ -117,7 +117,7 @@ def is_ours(study: optuna.Study) -> bool:
 
 
 def _check_same(settings: StudySettings, study: optuna.Study, wanted: Mapping[str, Any]) -> bool:
-    """Return whether its trials have another configuration, which the settings allow; raise if they do not."""
+    """Return whether a study's trials have another configuration; raise if the settings do not allow that."""
     there = study.user_attrs
     if not is_ours(study):
         raise StudyError(f"study.name is {settings.name!r}, but that study in its storage was not made by armscan")
@@ -143,10 +143,10 @@ def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
 
 
 def best_trials(study: optuna.Study, n_best: int) -> list[FrozenTrial]:
-    """Return the best trials of a study, each with other values, the best first.
+    """Return the best trials of a study, each with different values, the best first.
 
-    Trials that violate a constraint are left out; of a population, all but the members of its latest generation. With
-    several objectives these are those that no other is better than in all of them, by the first objective.
+    Trials that violate a constraint are left out, and in a population all but the latest generation. With several
+    objectives these are the trials on the Pareto front, ordered by the first objective.
     """
     several = len(study.directions) > 1
     trials = study.best_trials if several else study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))

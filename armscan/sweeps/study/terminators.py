@@ -1,4 +1,4 @@
-"""Terminators: when a study ends before its last trial, because more of them would gain nothing."""
+"""Terminators: rules that end a study before its last trial, because further trials would gain nothing."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ BETTER_PART = 0.5
 
 
 class Terminator(Protocol):
-    """Says when a study ends."""
+    """Rule that ends a study before its last trial."""
 
     def check(self, n_objectives: int, n_seeds: int) -> None:
-        """Raise `InvalidValueError` if it cannot work for so many objectives and seeds of a trial."""
+        """Raise `InvalidValueError` if it does not support this number of objectives, or of seeds of a trial."""
 
     def reason(self, study: optuna.Study, objectives: Sequence[str], state: StudyState) -> str | None:
         """Return why the study ends; None while it continues."""
@@ -37,13 +37,13 @@ class BelowSeedNoise:
     """Ends a study when the regret of its best trial is below the noise between seeds.
 
     The regret is bounded from above with a Gaussian process (Makarova et al. 2022, arXiv:2104.08166), by Optuna's
-    `RegretBoundEvaluator`; the noise is the standard deviation of one training of the better half of the trials.
+    `RegretBoundEvaluator`; the noise is the standard deviation between seeds in the better half of the trials.
 
     Args:
         min_trials: Completed trials that the study needs before it may end, 2 or more. Default: 20.
 
     Raises:
-        InvalidValueError: If there are too few.
+        InvalidValueError: If the number is too small.
     """
 
     def __init__(self, min_trials: int = 20) -> None:
@@ -80,13 +80,13 @@ class BelowSeedNoise:
 class Stagnation:
     """Ends a study when its last trials were no better than those before.
 
-    With several objectives a trial is better if it is on the Pareto front of all, and no trial before is as good.
+    With several objectives a trial is better if it is on the Pareto front of all trials, and no earlier one is as good.
 
     Args:
-        n_trials: Latest completed trials without an improvement, 1 or more. Default: 30.
+        n_trials: Number of latest completed trials without an improvement, 1 or more. Default: 30.
 
     Raises:
-        InvalidValueError: If there are too few.
+        InvalidValueError: If the number is too small.
     """
 
     def __init__(self, n_trials: int = 30) -> None:

@@ -1,4 +1,4 @@
-"""Trials that a study begins with: those of other studies, and settings of presets that are tried first."""
+"""Initial trials of a study: finished trials of other studies, and settings that are tried first."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from armscan.sweeps.study.settings import StudySettings
 from armscan.sweeps.study.study import best_trials, comparable_settings, is_ours
 
 PRESET, SOURCE = "preset {}", "study {}"
-# Best settings of a study with another configuration that are tried first.
+# Number of best settings that are tried first, of a study with another configuration.
 N_ENQUEUED = 10
 NO_LIMIT = 10**9
 # In `study.enqueue`: the configuration of the study itself.
@@ -48,10 +48,10 @@ KEPT = (METRICS, SEEDS, ENV_STEPS)
 
 @dataclass(frozen=True)
 class InitialTrials:
-    """Trials that a study begins with, all of one origin.
+    """Initial trials of a study, all of one origin.
 
     Args:
-        origin: Name of the study or the preset, and its kind.
+        origin: Kind and name of their origin: `study NAME` or `preset NAME`.
         message: Line about the part that is taken, and why the rest is not.
         taken: Finished trials, with their values.
         enqueued: Settings to try first.
@@ -69,7 +69,7 @@ class InitialTrials:
             begun_with = study.user_attrs.get(BEGUN_WITH, [])
             if self.origin in begun_with:
                 return False
-            # Those that a process has added that ended in between.
+            # Places of trials that an earlier process added before it died.
             places = {trial.user_attrs.get(TAKEN_FROM) for trial in study.get_trials(deepcopy=False)}
             for trial in self.taken:
                 if trial.user_attrs[TAKEN_FROM] not in places:
@@ -85,9 +85,9 @@ class InitialTrials:
 def initial_trials(
     settings: StudySettings, overrides: Sequence[str], fixed: Mapping[str, Any], study: optuna.Study | None
 ) -> list[InitialTrials]:
-    """Return the trials that a study begins with: of the presets of `study.enqueue`, then of other studies.
+    """Return the initial trials of a study, from `study.enqueue` and `study.warm_start`; finished trials come first.
 
-    The other studies are those of `study.warm_start`. Trials that it has already are left out.
+    Those of an origin that the study has already begun with are left out.
 
     Args:
         settings: Settings of the study.
@@ -106,7 +106,7 @@ def initial_trials(
         *(_of_preset(settings.space, name, overrides) for name in presets),
         *(_of_study(settings, name, fixed, storage) for name in sources),
     ]
-    # First what is taken: the settings of a trial with a value need not be tried again.
+    # Finished trials first: settings that have a value need not be tried again.
     return sorted(initial, key=lambda each: not each.taken)
 
 
@@ -119,7 +119,7 @@ def _of_preset(space: Space, name: str, overrides: Sequence[str]) -> InitialTria
 
 
 def values_of(space: Space, overrides: Sequence[str]) -> tuple[dict[str, Value], str | None]:
-    """Return the values that a configuration has of the keys of a space, and those that do not lie in it.
+    """Return a configuration's values of the keys of a space, and the first misfit.
 
     Args:
         space: Space of the keys.
@@ -129,7 +129,7 @@ def values_of(space: Space, overrides: Sequence[str]) -> tuple[dict[str, Value],
         See `Space.fit`.
     """
     config, choices = compose_run(overrides)
-    # Of a group the name that was chosen, of any other key its value.
+    # A group has the name that was chosen, any other key its value.
     found = {each.name: choices.get(each.name, OmegaConf.select(config, each.name)) for each in space.parameters}
     plain = {key: to_plain(value) if OmegaConf.is_config(value) else value for key, value in found.items()}
     return space.fit({key: optuna_value(value) for key, value in plain.items()})
@@ -178,7 +178,7 @@ def _source(settings: StudySettings, name: str, storage: Storage | None) -> optu
 
 
 def _difference(there: Mapping[str, Any], wanted: Mapping[str, Any]) -> str | None:
-    """Return the difference that makes a study's values useless for another, apart from searched keys; else None."""
+    """Return the first difference, except in searched keys, that makes a study's values useless; None without one."""
     if there[OBJECTIVES] != wanted[OBJECTIVES]:
         return f"its objectives are {' and '.join(there[OBJECTIVES])}"
     searched = tuple(f"{key}." for key in (*renamed(there[SPACE]), *wanted[SPACE]))
@@ -198,13 +198,13 @@ def _not_searched(params: Mapping[str, Value], chosen: Mapping[str, Value], fixe
 
 
 def _plain(flat: Mapping[str, Any]) -> dict[str, Value]:
-    """Return the values of a flattened configuration as Optuna keeps them; its lists are JSON."""
+    """Return the values of a flattened configuration, whose lists are JSON, as Optuna stores them."""
     is_list = {key: isinstance(value, str) and value.startswith("[") for key, value in flat.items()}
     return {key: optuna_value(json.loads(value) if is_list[key] else value) for key, value in flat.items()}
 
 
 def first_different(settings: Iterable[dict[str, Value]]) -> tuple[dict[str, Value], ...]:
-    """Return the first ten different settings, those that a warm start tries first."""
+    """Return the first ten different settings, which a warm start tries first."""
     first: list[dict[str, Value]] = []
     for each in settings:
         if len(first) < N_ENQUEUED and each not in first:
@@ -213,7 +213,7 @@ def first_different(settings: Iterable[dict[str, Value]]) -> tuple[dict[str, Val
 
 
 def _taken(name: str, trial: FrozenTrial, chosen: dict[str, Value], space: Space) -> FrozenTrial:
-    """Return a trial of another study as one of this study, with its place there."""
+    """Return a trial of another study as one of this study, with the study and number that it had there."""
     place = trial.user_attrs.get(TAKEN_FROM, f"{name}:{trial.number}")
     return create_trial(
         state=trial.state,

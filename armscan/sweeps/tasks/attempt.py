@@ -42,9 +42,9 @@ class Attempt:
         run_id: MLflow run ID of the trial.
         tags: Tags of the tracked runs of its trainings, which name their study and trial.
         objectives: Names of the metrics that it reports to the pruner while it runs; none without pruning.
-        report_progress: Function that takes the progress of the trial.
-        opened: Function that takes the tracked run of a training at its start, and None at its end.
-        show_picture: Function that takes a file for the dashboard.
+        report_progress: Function to call with the progress of the trial.
+        opened: Function to call with the tracked run of a training at its start, and with None at its end.
+        show_picture: Function to call with an image file for the dashboard.
         writes: Pending writes about the trial.
         transaction: Function that runs a transaction; see `Storage.transaction`.
     """
@@ -65,7 +65,7 @@ class Attempt:
     transaction: Callable[[Callable[[], bool]], bool]
     env_steps: int = field(default=0, init=False)
     _of_seeds: dict[str, Mapping[str, float]] = field(init=False)
-    # Steps that have been reported, also before the trial was requeued.
+    # Steps that have been reported, including those before the trial was requeued.
     _reported: set[int] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -99,28 +99,28 @@ class Attempt:
     def config(self, seed: int) -> tuple[DictConfig, dict[str, str]]:
         """Return the configuration of one of its trainings, and the choice of each group."""
         config, choices = self.composed
-        # Much quicker than to compose it once more.
+        # Much faster than composing it again.
         seeded = config.copy()
         seeded.seed = seed
         return seeded, choices
 
     @property
     def seeds_done(self) -> dict[int, Mapping[str, float]]:
-        """The metrics of the seeds that have been run to their end, also by an attempt before."""
+        """The metrics of the completed seeds, including those of an earlier attempt."""
         return {int(seed): metrics for seed, metrics in self._of_seeds.items()}
 
     def keep_seed(self, seed: int, metrics: Mapping[str, float]) -> None:
-        """Keep the metrics of a seed that has been run to its end."""
+        """Store the metrics of a completed seed."""
         self._of_seeds = self._of_seeds | {str(seed): dict(metrics)}
         self.writes.append(partial(self.trial.set_user_attr, SEEDS, self._of_seeds))
         if any(each not in self.seeds_done for each in self.seeds):
-            # The next report may be long in coming, and a retry must not train this seed again.
+            # At once: the next report may take long, and a retry must not train this seed again.
             self.writes.flush_with(self.transaction, lambda: True)
 
     def keep_episodes(self, evaluations: Mapping[str, Evaluation]) -> None:
-        """Store the episodes of the final evaluation in the storage, by the name of their volumes.
+        """Store the episodes of the final evaluation, by the name of their volumes or baseline.
 
-        They are no user attributes, which the dashboard would show in full.
+        They are not user attributes, which the dashboard would show in full.
         """
         plain: dict[str, Any] = {
             name: {"on_plane": each.on_plane, "episodes": each.columns()} for name, each in evaluations.items()
@@ -138,10 +138,10 @@ class Attempt:
         total_env_steps: int,
         n_inherited_env_steps: int = 0,
     ) -> None:
-        """Report how a training is going.
+        """Report the progress of a training.
 
         Args:
-            metrics: Metrics so far: the objectives, and `mean_return` for the screen, if known. A trial that does not
+            metrics: Metrics so far: the objectives, and `mean_return` for display, if known. A trial that does not
                 report every objective is not pruned.
             seed: Seed of the training.
             n_env_steps: Environment steps so far.
@@ -169,8 +169,8 @@ class Attempt:
 
     def _is_to_be_pruned(self, step: int, values: Sequence[float]) -> bool:
         study, storage, trial_id = self.trial.study, self.trial.storage, self.trial._trial_id
-        # Not by the trial's own methods. They report nothing twice, though the storage may have lost it with its
-        # connection, and refuse several objectives.
+        # Not by the trial's own methods: they never repeat a report, although the storage may have lost it with the
+        # connection, and they refuse several objectives.
         keep_report(storage, trial_id, step, values)
         return study.pruner.prune(study, storage.get_trial(trial_id))
 
@@ -186,7 +186,7 @@ class Task(Protocol):
         """Name of the leading metric that `evaluate` returns."""
 
     def check(self, config: DictConfig) -> None:
-        """Check that a trial with this configuration could begin; called for many before the first trial.
+        """Check that a trial with this configuration could begin; called for many of them before the first trial.
 
         Raises:
             ArmscanError: If it could not.
@@ -196,17 +196,17 @@ class Task(Protocol):
         """Run a trial, or resume one, and return its metrics.
 
         Raises:
-            optuna.TrialPruned: If the trial is not worth going on with.
+            optuna.TrialPruned: If the trial is pruned.
         """
 
     def validate(self, attempt: Attempt) -> dict[str, float]:
-        """Run a candidate with one seed, and return the metrics that `run` returns, of the validation volumes.
+        """Run a candidate with one seed, and return the metrics that `run` returns, on the validation volumes.
 
-        Candidates are compared by them, so they must not be those of the best of several looks.
+        Candidates are compared by these metrics, so they must not be the best of several validations.
         """
 
     def evaluate(self, attempt: Attempt) -> dict[str, float]:
-        """Run the chosen configuration, or the control, with one other seed, and return the metrics of the test.
+        """Run the chosen configuration, or the control, with one other seed, and return metrics on the test volumes.
 
         Their names begin with `test/`.
         """
@@ -224,7 +224,7 @@ def config_sha256(config: Mapping[str, Any]) -> str:
 
 
 def volumes_of(config: DictConfig) -> Split:
-    """Return the volumes of a configuration, which stay in memory until those of another are asked for."""
+    """Return the volumes of a configuration, which stay in memory until those of another one are requested."""
     return _volumes(OmegaConf.to_yaml(config.data, resolve=True))
 
 

@@ -41,7 +41,7 @@ def begin_generation(attempt: Attempt, setup: Experiment, folder: Path, *, run_i
 
 
 def inherited(attempt: Attempt, reports: Sequence[EpochReport]) -> EpochReport | None:
-    """Return the last epoch that a trial has from its parent; None if it has none.
+    """Return the last epoch that a trial has inherited from its parent; None if there is none.
 
     Args:
         attempt: The attempt at the trial.
@@ -56,7 +56,7 @@ def best_of_generation(reports: Sequence[EpochReport], before: EpochReport | Non
 
     Args:
         reports: Reports of all epochs of its training.
-        before: Last epoch that it has from its parent; None if it has none.
+        before: Last epoch that it has inherited from its parent; None if there is none.
         best_by: Criterion that chooses the best epoch; see `Evaluation.score`.
     """
     own = [report for report in reports if before is None or report.epoch > before.epoch]

@@ -1,4 +1,4 @@
-"""A trial that trains nothing: how well one way of clustering tells the labelled planes from the rest of the arm."""
+"""A trial without training: how well a clustering distinguishes the labelled planes from the rest of the arm."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from armscan.volumes import LabelVolume
 from armscan.volumes.plane import ManipulatorAction
 
 METRICS = ("separation", "labelled_reward", "elsewhere_reward", "worst_labelled_reward")
-# Planes nearer to the labelled one than this are neither right nor wrong; the others are looked at in these steps.
+# Planes nearer to the labelled one than this are neither right nor wrong; the others are sampled in these steps.
 NEAR_MM, STEP_MM = 15.0, 2.5
 
 
 class LandmarksTask:
-    """The task of clustering: rewards at the labelled planes, and at planes along the rest of the arm.
+    """The task of clustering: compare rewards at the labelled planes with those at planes along the rest of the arm.
 
-    The space has keys of `env.clustering`, which is written in full.
+    The space has keys of `env.clustering`, which the configuration must write in full.
     """
 
     def metrics(self, config: DictConfig) -> tuple[str, ...]:
@@ -35,7 +35,7 @@ class LandmarksTask:
 
     @property
     def final_metric(self) -> str:
-        """The difference, on the test volumes."""
+        """Name of the difference on the test volumes."""
         return f"{TEST_PREFIX}separation"
 
     def check(self, config: DictConfig) -> None:
@@ -49,17 +49,17 @@ class LandmarksTask:
         volumes_of(config)
 
     def run(self, attempt: Attempt) -> dict[str, float]:
-        """Look at the training volumes. See `Task.run`."""
+        """Return the metrics on the training volumes. See `Task.run`."""
         config, _ = attempt.config(attempt.seeds[0])
         return self._run_task(config, volumes_of(config).training)
 
     def validate(self, attempt: Attempt) -> dict[str, float]:
-        """Look at the validation volumes. See `Task.validate`."""
+        """Return the metrics on the validation volumes. See `Task.validate`."""
         config, _ = attempt.config(attempt.seeds[0])
         return self._run_task(config, volumes_of(config).validation)
 
     def evaluate(self, attempt: Attempt) -> dict[str, float]:
-        """Look at the test volumes. See `Task.evaluate`."""
+        """Return the metrics on the test volumes. See `Task.evaluate`."""
         config, _ = attempt.config(attempt.seeds[0])
         metrics = self._run_task(config, volumes_of(config).test)
         return {f"{TEST_PREFIX}{name}": value for name, value in metrics.items()}

@@ -10,7 +10,7 @@ from armscan.sweeps.tasks.attempt import Attempt
 from armscan.sweeps.tasks.generation import best_of_generation, inherited
 from armscan.training import Budget, EpochReport, Evaluation, TrainingResult
 
-# Of each training, beside the metrics of its best validation.
+# Metrics of each training, in addition to those of its best validation.
 TRAINING_METRICS = (ENV_STEPS, "training_s", "solved")
 
 
@@ -36,13 +36,13 @@ class Reporter:
             self.on_epoch(report)
 
     def on_epoch(self, report: EpochReport) -> None:
-        """Report the validation of an epoch, unless the trial has it from its parent."""
+        """Report the validation of an epoch, unless the trial has inherited the epoch from its parent."""
         self.reports.append(report)
         before = inherited(self.attempt, self.reports)
         if before is not None and report.epoch <= before.epoch:
             return
         grid = self.budget.eval_every_env_steps
-        # On the grid: how far the environments of a vector step beyond it says nothing of a trial.
+        # Rounded down to the grid: how far vectorised environments step beyond it says nothing about a trial.
         so_far = dict(zip(TRAINING_METRICS, (report.n_env_steps // grid * grid, report.wall_s, 0.0), strict=True))
         self.attempt.report(
             self._validation().metrics() | so_far,
@@ -54,10 +54,10 @@ class Reporter:
         )
 
     def on_end(self) -> None:
-        """Report nothing: `metrics` has what the training has reached."""
+        """Report nothing: `metrics` returns the result of the training."""
 
     def metrics(self, result: TrainingResult) -> dict[str, float]:
-        """Return the metrics of the ended training, without what it has inherited from another trial."""
+        """Return the metrics of a finished training, without what it has inherited from another trial."""
         before = inherited(self.attempt, result.reports)
         best = best_of_generation(result.reports, before, self.budget.best_by).evaluation.metrics()
         n_before, before_s = (before.n_env_steps, before.wall_s) if before is not None else (0, 0.0)
@@ -65,7 +65,7 @@ class Reporter:
         return best | dict(zip(TRAINING_METRICS, measured, strict=True))
 
     def _validation(self) -> Evaluation:
-        """Return the last validation; with several objectives the best, as if the training ended now.
+        """Return the last validation; with several objectives the best one, as if the training ended now.
 
         Pruners of one objective take the best report themselves.
         """

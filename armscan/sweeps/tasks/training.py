@@ -41,7 +41,7 @@ from armscan.utils.files import LAST_CHECKPOINT, LEARNING_CURVE_FILE, RUN_FILE, 
 from armscan.utils.log import log
 from armscan.utils.retry import RETRY_S
 
-# First seed of the episodes that candidates are compared by, which are played for nothing else.
+# First seed of the episodes by which candidates are compared, which are used for nothing else.
 SELECTION_SEED = 7 * 10**6
 Conclude = Callable[[Experiment, TrainingResult, TrackedRun, Path], dict[str, float]]
 
@@ -55,7 +55,7 @@ class TrainingTask:
 
     @property
     def final_metric(self) -> str:
-        """The mean steps of an episode."""
+        """Name of the mean steps of an episode on the test volumes."""
         return f"{TEST_PREFIX}mean_steps"
 
     def check(self, config: DictConfig) -> None:
@@ -70,7 +70,7 @@ class TrainingTask:
     def run(self, attempt: Attempt) -> dict[str, float]:
         """Train with each seed; return the interquartile means of the metrics over the seeds. See `Task.run`.
 
-        Of `solved`, which is a share of the seeds, it is the mean.
+        For `solved`, a share of the seeds, return the mean.
         """
         for seed in attempt.seeds:
             if seed not in attempt.seeds_done:
@@ -81,12 +81,12 @@ class TrainingTask:
         return {name: float(figures[name](of_name)) for name, of_name in scores.items()}
 
     def validate(self, attempt: Attempt) -> dict[str, float]:
-        """Train, and play episodes on the validation volumes that chose no weights; return their metrics."""
+        """Train, and return the metrics of validation episodes that had no part in choosing the weights."""
         (seed,) = attempt.seeds
         return _train(attempt, seed, partial(_evaluate_on_validation, attempt))
 
     def evaluate(self, attempt: Attempt) -> dict[str, float]:
-        """Train, evaluate, record a video and keep the policy; return the metrics of the test."""
+        """Train, evaluate, record a video and save the policy; return the metrics on the test volumes."""
         (seed,) = attempt.seeds
         return _train(attempt, seed, partial(_evaluate_on_test, attempt))
 
@@ -108,7 +108,7 @@ def _evaluate_on_validation(
 def _evaluate_on_test(
     attempt: Attempt, setup: Experiment, result: TrainingResult, tracked: TrackedRun, folder: Path
 ) -> dict[str, float]:
-    """Evaluate a trained agent beside the baselines, and store the results; return the metrics of the test."""
+    """Evaluate a trained agent and the baselines, and store the results; return the metrics on the test volumes."""
     reached = RunResult.of(setup, result)
     reached.write(folder, title=tracked.name)
     log_result(tracked, result, reached)
@@ -128,7 +128,7 @@ def _evaluate_on_test(
 
 
 def _train(attempt: Attempt, seed: int, conclude: Conclude | None = None) -> dict[str, float]:
-    """Train with one seed, from the last checkpoint if there is one; return metrics, also those of `conclude`."""
+    """Train with one seed, from the last checkpoint if there is one; return metrics, including those of `conclude`."""
     config, choices = attempt.config(seed)
     setup = set_up(config)
     folder = attempt.folder / f"seed_{seed}"
@@ -180,7 +180,7 @@ def _start_or_resume(
             setup = set_up(config)
         else:
             client, experiment_id = open_store(**to_plain(config.tracking), retry_s=RETRY_S)
-            # An attempt before had another trial's number.
+            # An earlier attempt had another trial number.
             known = {STUDY_TAG: attempt.tags[STUDY_TAG], "seed": str(seed)}
             run = run_of_study(client, run_id, experiment_id=experiment_id, tags=known, where=str(begun))
             tags = {**volume_tags(setup.fingerprints), **place_tags(folder), **attempt.tags}
@@ -194,7 +194,7 @@ def _start_or_resume(
 
 
 def _take_over(attempt: Attempt, folder: Path) -> None:
-    """Copy the files of the earlier attempt that this one does not have yet."""
+    """Copy the files of the earlier attempt, unless this one has begun."""
     before = attempt.folder_before / folder.name if attempt.folder_before else None
     if before is None or (folder / RUN_FILE).exists() or not (before / RUN_FILE).exists():
         return
@@ -202,5 +202,5 @@ def _take_over(attempt: Attempt, folder: Path) -> None:
         if file.is_file() and not file.name.startswith(".") and file.name != RUN_FILE:
             shutil.copyfile(file, folder / file.name)
     take_over(json.loads((before / RUN_FILE).read_text())["run_id"], before, folder)
-    # Last: from then on this folder counts.
+    # Last: from then on this folder takes precedence.
     shutil.copyfile(before / RUN_FILE, folder / RUN_FILE)

@@ -19,13 +19,13 @@ from armscan.utils.log import log
 from armscan.utils.processes import ProcessInfo
 
 HEARTBEAT_S, POLL_S = 10.0, 0.25
-# Without a heartbeat for so long a worker counts as dead: a busy storage may delay some.
+# A worker without a heartbeat for this long counts as dead; a busy storage may delay some heartbeats.
 DEAD_AFTER_S = 40.0
-# Up to so many running trials, each worker checks all at each heartbeat, and less often with more of them: a check
-# costs the storage something for each running trial.
+# With up to this many running trials, each worker checks all of them at each heartbeat; with more it checks less often,
+# because a check costs the storage some time for each running trial.
 MAX_CHECKERS = 64
-# Longest time between two checks that counts as silence, in expected intervals: in a longer one the storage was
-# unavailable for all, and nobody could renew a lease.
+# Longest time between two checks that counts as silence, in expected intervals: if it was longer, the storage was
+# unavailable for all workers, and none could renew a lease.
 MAX_UNSEEN = 1.5
 # If the storage is unavailable, the trial cannot be requeued: it is reclaimed later, because its process is gone.
 REQUEUE_TIMEOUT_S = 5.0
@@ -35,20 +35,20 @@ OPENING_TIMEOUT_S = 2.0
 
 
 class LimitReachedError(Exception):
-    """The study's time or environment steps are spent, or it was stopped: the current trial is requeued."""
+    """The study's time or environment steps are used up, or it was stopped: the current trial is requeued."""
 
 
 class LivenessCheck:
-    """Tells dead workers from living ones, by its own clock: clocks of machines differ."""
+    """Tells dead workers from living ones, by its own clock, because the clocks of machines differ."""
 
     def __init__(self) -> None:
-        # Between two checks.
+        # Expected time between two checks.
         self.interval_s = HEARTBEAT_S
         # By trial: its last heartbeat, when it was last checked, and for how long it had been the same by then.
         self._seen: dict[int, tuple[Any, float, float]] = {}
 
     def is_dead(self, trial: FrozenTrial) -> bool:
-        """Return whether the worker of a running trial has ended, or has not renewed its lease for long."""
+        """Return whether the worker of a running trial has ended, or has not renewed its lease for too long."""
         lease = trial.user_attrs.get(LEASE, {})
         holder = ProcessInfo.of(lease)
         if holder.is_here:
@@ -71,8 +71,8 @@ class Heartbeat:
         scheduler: Scheduler of the study.
         worker: Name of this worker.
         is_told_to_leave: Function that is polled several times a second.
-        leave: Function that ends the process, once the current trial is requeued; mostly called in another thread than
-            the worker's.
+        leave: Function that ends the process, once the current trial is requeued; mostly called from another thread
+            than the worker's.
         on_death: Function that is called with each reclaimed trial.
         is_told_to_leave_soon: Function that is polled when a trial is claimed and when it reports progress, where
             leaving loses nothing.
@@ -100,12 +100,12 @@ class Heartbeat:
         # Whether somebody has asked for the end of the current trial.
         self._is_trial_stopped = False
         self._next_check_s = 0.0
-        # Held while a trial is claimed or requeued, so that leaving in between forgets none.
+        # Held while a trial is claimed or requeued, so that no trial is lost if the worker leaves in between.
         self._changing, self._cleaning = threading.Lock(), threading.Lock()
         # Held while the tracked run of the current trial is being opened.
         self.opening = threading.Lock()
         self._stopped = threading.Event()
-        # Two: heartbeats wait for a storage that is unavailable, and leaving does not.
+        # Two: heartbeats wait for an unavailable storage, but leaving does not.
         self._threads = [threading.Thread(target=each, daemon=True) for each in (self._watch, self._beat)]
 
     @contextmanager
@@ -121,9 +121,9 @@ class Heartbeat:
                 thread.join()
 
     def claim(self, outcome: TrialOutcome | None = None, cleanup: Callable[[], None] | None = None) -> Trial | None:
-        """Claim a trial as `TrialScheduler.claim` does, and hold it; `cleanup` is that of the trial before."""
+        """Claim a trial as `TrialScheduler.claim` does, and hold it; `cleanup` is that of the previous trial."""
         with self._changing:
-            # The progress of the trial before is not this one's.
+            # Drop the progress of the previous trial.
             self._lease = {key: self._lease[key] for key in (*HOLDER, "beat")} | {BEAT_S: time.time()}
             self._trial = self._scheduler.claim(self._lease, outcome)
             self.cleanup, self.writes = cleanup, PendingWrites()
@@ -142,7 +142,7 @@ class Heartbeat:
         """Keep the trial's progress for the next renewal of the lease.
 
         Raises:
-            LimitReachedError: If the study's time or environment steps are spent, or it was stopped.
+            LimitReachedError: If the study's time or environment steps are used up, or it was stopped.
             optuna.TrialPruned: If the trial was stopped.
         """
         self._lease = self._lease | progress
@@ -176,7 +176,7 @@ class Heartbeat:
                 late = threading.Timer(REQUEUE_TIMEOUT_S, self._leave)
                 late.daemon = True
                 late.start()
-                # Never released: this process is to open no further run.
+                # Never released: this process must not open another run.
                 self.opening.acquire(timeout=OPENING_TIMEOUT_S)
                 try:
                     self.requeue()
@@ -203,7 +203,7 @@ class Heartbeat:
                 return
             self._is_trial_stopped = any(trial.user_attrs.get(STOP) for trial in state.running if self._is_own(trial))
         self._liveness.interval_s = HEARTBEAT_S * max(1.0, len(state.running) / MAX_CHECKERS)
-        # An interval is never quite as long as it should be.
+        # Half a heartbeat of tolerance, because heartbeats are never exactly on time.
         self._next_check_s = time.monotonic() + self._liveness.interval_s - HEARTBEAT_S / 2
         for trial in self._scheduler.reclaim(self._liveness.is_dead, state):
             self._on_death(trial)

@@ -33,8 +33,8 @@ from armscan.utils.console import print_sentence
 from armscan.utils.processes import ProcessInfo
 from armscan.utils.retry import no_retry
 
-# Time that workers have to leave before their launcher is interrupted and those on this machine are killed; through a
-# shared folder other machines learn late that they are asked to.
+# Time that workers have to leave before their launcher is interrupted and those on this machine are killed; workers on
+# other machines see the request late, through a shared folder.
 LEAVE_S, LEAVE_ELSEWHERE_S = 4.0, 20.0
 # Ten years: a study has limits of its own.
 MINUTES_WITHOUT_END = 5_256_000
@@ -84,7 +84,7 @@ def _arguments(opened: OpenedStudy, given: StudyCommand, launcher: str, folder: 
     """Return the arguments that the workers are launched with."""
     n_workers, fixed = opened.settings.workers, fixed_by(given.overrides)
     arguments = ["-m", *given.launching]
-    # The addresses that only this machine's environment has.
+    # Addresses that only this machine's environment may set.
     addresses = {STORAGE: opened.settings.storage, TRACKING_URI: opened.config.tracking.uri}
     arguments += [f"{key}={hydra_literal(uri)}" for key, uri in addresses.items() if key not in fixed]
     arguments += [
@@ -92,7 +92,7 @@ def _arguments(opened: OpenedStudy, given: StudyCommand, launcher: str, folder: 
         f"hydra.sweep.dir={hydra_literal(str(folder))}",
     ]
     if launcher == USUAL_LAUNCHER:
-        # Before the others, which may say something else.
+        # First, so that the user's overrides take precedence.
         arguments.insert(1, f"hydra.launcher.timeout_min={MINUTES_WITHOUT_END}")
     if launcher == "joblib":
         arguments.append(f"hydra.launcher.n_jobs={n_workers}")
@@ -100,19 +100,19 @@ def _arguments(opened: OpenedStudy, given: StudyCommand, launcher: str, folder: 
 
 
 def _launch_elsewhere(monitor: StudyMonitor, folder: Path, launcher: str, launch: Callable[[], object]) -> None:
-    """Launch workers on other machines, and wait for the end of the study, with the launcher or without."""
+    """Launch workers on other machines, and wait for the end of the study, even if the launcher fails."""
     silence_launcher(launcher)
     try:
         with monitor.interrupting():
             launch()
     except SystemExit:
-        # What Ray has put in the place of our answer to SIGTERM.
+        # Raised by Ray's handler of SIGTERM, which has replaced ours.
         signal.raise_signal(signal.SIGINT)
         monitor.wait_for_requeue()
-    # What a worker's machine has said, after all of them have ended.
+    # An error from a worker's machine, raised after all workers have ended.
     except ArmscanError as error:
         print(f"error: {error}", file=sys.stderr)
-    # Any error of a launcher, also for one cancelled job while all others go on.
+    # Any error of a launcher, which may fail for one cancelled job while all others continue.
     except Exception as error:
         line = one_line_message(error) or " ".join(str(error).split()) or repr(error)
         failed = StudyError(f"{LAUNCHER} is {launcher!r}, which has failed: {line[:MAX_REASON_CHARS]}")
@@ -125,11 +125,11 @@ def _launch_elsewhere(monitor: StudyMonitor, folder: Path, launcher: str, launch
 
 @contextlib.contextmanager
 def _leaving(opened: OpenedStudy, folder: Path, tracked: TrackedRun, leave_s: float) -> Iterator[None]:
-    """Leave no worker and no open run behind; a context to launch the workers in."""
+    """Return a context to launch the workers in, which leaves no worker and no open run behind."""
     status, is_asked = "FINISHED", False
 
     def ask(*_: object) -> None:
-        """Ask the workers to leave; an interrupted launcher may kill them before they can. A handler takes no lock."""
+        """Ask the workers to leave before an interrupted launcher may kill them; as a handler, take no lock."""
         nonlocal is_asked
         if is_asked:
             raise KeyboardInterrupt
@@ -138,7 +138,7 @@ def _leaving(opened: OpenedStudy, folder: Path, tracked: TrackedRun, leave_s: fl
         signal.setitimer(signal.ITIMER_REAL, leave_s)
 
     asking = [signal.SIGINT, signal.SIGTERM, signal.SIGALRM]
-    # Its terminal was closed; where `nohup` has it go on, it does.
+    # The terminal was closed; ignored under `nohup`.
     asking += [signal.SIGHUP] if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN else []
     before = {each: signal.signal(each, ask) for each in asking}
     try:
@@ -175,7 +175,7 @@ def _deliver(opened: OpenedStudy, tracked: TrackedRun, status: str) -> None:
     is_there = tracked.end(status, wait_s=SHORT_WAIT_S if status == "KILLED" else None)
     left = []
     if is_there:
-        # Anyone who may write into the folder of a study can execute code in it.
+        # Trusted: anyone who may write into the folder of a study can execute code in it anyway.
         deliveries = sync(opened.folder, lambda _: opened.search.client, trust=True)
         left = [each.folder for each in deliveries if each.left]
         with contextlib.suppress(ArmscanError), no_retry():

@@ -18,7 +18,7 @@ class LeaveRequest:
 
     def __init__(self) -> None:
         self._is_now = False
-        # When soon is now, by the clock of `time.monotonic`.
+        # Deadline of a request to leave soon, by the clock of `time.monotonic`.
         self._late_s = math.inf
 
     def ask_now(self, *_: object) -> None:
@@ -26,7 +26,7 @@ class LeaveRequest:
         self._is_now = True
 
     def ask_soon(self, *_: object) -> None:
-        """Ask to leave within `SOON_S` seconds of the first time that this is asked."""
+        """Ask to leave within `SOON_S` seconds of the first such request."""
         self._late_s = min(self._late_s, time.monotonic() + SOON_S)
 
     @property
@@ -36,5 +36,5 @@ class LeaveRequest:
 
     @property
     def is_soon(self) -> bool:
-        """Whether to leave where that loses nothing."""
+        """Whether to leave as soon as that loses nothing."""
         return self._late_s < math.inf

@@ -15,7 +15,7 @@ from armscan.sweeps.workers.heartbeat import LivenessCheck
 from armscan.utils.retry import no_retry
 
 LOOK_S = 5.0
-# A launcher that waits for longer after the end of a study waits for a lost worker.
+# A launcher that waits longer than this after the end of a study is waiting for a lost worker.
 OVER_S = 20.0
 # There is no heartbeat between two trials, nor while a worker starts.
 LIFELESS_S = 120.0
@@ -26,7 +26,7 @@ class StudyMonitor:
 
     def __init__(self, opened: OpenedStudy) -> None:
         self._opened = opened
-        # One for each phase: trials of all phases have the same numbers.
+        # One for each phase, because trial numbers repeat across phases.
         self._liveness: dict[str, LivenessCheck] = defaultdict(LivenessCheck)
 
     def is_over(self) -> bool:
@@ -73,12 +73,12 @@ class StudyMonitor:
 
     @contextlib.contextmanager
     def interrupting(self) -> Iterator[None]:
-        """Interrupt a launcher that still waits when the study is over; a context to launch in."""
+        """Return a context to launch in, which interrupts a launcher that still waits when the study is over."""
         is_over, is_left = threading.Event(), threading.Event()
 
         def interrupt(*_: object) -> None:
             if not is_left.is_set():
-                # Every launcher lets this through.
+                # No launcher catches this.
                 raise KeyboardInterrupt
 
         def watch() -> None:

@@ -1,4 +1,4 @@
-"""Signals of Slurm to the job of a worker: it is to end soon, or now."""
+"""Slurm's signals to the job of a worker: to end soon, or now."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any, Self
 
 from armscan.utils.log import log
 
-# Sent before a job's time is over or it is preempted, as submitit asks for; and when it is cancelled or requeued.
+# SOON comes before a job's time is over or it is preempted, as submitit requests; NOW when it is cancelled or requeued.
 SOON, NOW = signal.SIGUSR2, signal.SIGTERM
 ASKING_S = 60
 
@@ -33,7 +33,7 @@ class SlurmSignals:
     @classmethod
     @contextlib.contextmanager
     def handled(cls) -> Iterator[Self]:
-        """Handle the signals of a Slurm job in place of submitit; a context to supervise a worker in."""
+        """Return a context to supervise a worker in, which handles a Slurm job's signals in place of submitit."""
         if os.environ.get("SUBMITIT_EXECUTOR") != "slurm":
             yield cls(None)
             return
@@ -59,10 +59,10 @@ class SlurmSignals:
     def requeue_job(self) -> None:
         """Requeue the job, unless Slurm ends it for good.
 
-        Returns if it does: then the job has a result, and its launcher waits only for the others.
+        In that case return: then the job has a result, and its launcher waits only for the others.
 
         Raises:
-            SystemExit: If it is requeued: without a result the launcher waits on.
+            SystemExit: If the job is requeued; without a result its launcher keeps waiting.
         """
         state, n_restarts = _state()
         if n_restarts > int(os.environ.get("SLURM_RESTART_COUNT", 0)):
@@ -70,14 +70,14 @@ class SlurmSignals:
             raise SystemExit(1)
         if state == "RUNNING" and callable(self._requeue):
             try:
-                # Submitit's own: it leaves where the job is queued.
+                # Submitit's own handler, which exits once the job is queued.
                 self._requeue(SOON, None)
             except Exception as error:
                 log(f"this job could not be requeued: {error!r}")
 
 
 def _state() -> tuple[str, int]:
-    """Return the state of this job and how often it has been requeued, as Slurm knows it."""
+    """Return Slurm's state of this job, and how often it has been requeued."""
     variables = ("SLURM_ARRAY_JOB_ID", "SLURM_ARRAY_TASK_ID")
     of_array = [os.environ[each] for each in variables if each in os.environ]
     job = "_".join(of_array) if len(of_array) == len(variables) else os.environ["SLURM_JOB_ID"]

@@ -1,6 +1,6 @@
 """The process of a worker, and its supervisor, which restarts it when it is killed.
 
-The supervisor does nothing else: nothing slow to import, such as torch and MLflow, is imported here.
+The supervisor does nothing else, so nothing slow to import, such as torch and MLflow, is imported here.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from armscan.utils.processes import ProcessInfo, child_command, on_parent_exit
 
 LAUNCHER_FILE, STOP_FILE, WORKER_FILES = "launcher.json", "stop", "worker-*.json"
 # Exit codes of a worker that was told to leave, of one whose storage was unavailable for too long, of one that cannot
-# work at the study as it is stored, and of all that are not restarted.
+# work on the study as it is stored, and of all that are not restarted.
 LEFT, UNAVAILABLE, REFUSED = 130, 75, 65
 ENDS = (0, LEFT, UNAVAILABLE, REFUSED)
 GPUS, KEPT_GPUS, ALL_GPUS = "CUDA_VISIBLE_DEVICES", "ARMSCAN_GPUS", "all"
@@ -34,7 +34,7 @@ MAX_ERRORS = 5
 
 
 def local_workers(folder: Path) -> list[ProcessInfo]:
-    """Return the workers of a start that are alive on this machine, and that this process sees."""
+    """Return the workers of a start that are alive on this machine, and visible to this process."""
     workers = [ProcessInfo.read(file) for file in folder.glob(WORKER_FILES)]
     return [each for each in workers if each.is_here and each.is_alive]
 

@@ -30,10 +30,10 @@ def open_run(
         trial: The trial.
         values: Its values by their keys.
         config_sha256: SHA-256 of its configuration.
-        writes: Pending writes about the trial, which get a note of a new run.
+        writes: Pending writes about the trial, to which a new run's note and ID are added.
 
     Returns:
-        The run, open.
+        The open run.
     """
     attributes, folder = trial.user_attrs, trial_folder(phase.folder, trial.number)
     tags = {
@@ -62,7 +62,7 @@ def open_run(
         folder=folder,
         parent_id=phase.run_id,
     )
-    # Before the trial knows its run: a resumed trial writes no note.
+    # Before the trial's run ID is written: a trial that has one writes no note.
     writes.append(partial(note_run, trial, phase.client, phase.experiment_id, tracked.run_id, folder))
     writes.append(partial(trial.set_user_attr, RUN, tracked.run_id))
     return tracked

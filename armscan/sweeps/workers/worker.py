@@ -37,7 +37,7 @@ MAX_REASON_CHARS = 2000
 
 
 class Worker:
-    """Runs trials of one phase of a study, one after another, each with its values beside the command's overrides.
+    """Runs trials of one phase of a study, one after another, each with the command's overrides and its own values.
 
     Args:
         phase: The phase.
@@ -62,9 +62,9 @@ class Worker:
         outcome: TrialOutcome | None = None
         conclude: Callable[[], None] | None = None
         while True:
-            # It may take seconds, in which others claim trials.
+            # Before claiming: it may take seconds, in which others claim trials.
             self._phase.scheduler.check_termination()
-            # One round trip for the trial before and the next: with many workers these add up.
+            # One operation tells the previous trial and claims the next: with many workers, operations add up.
             trial = self._heartbeat.claim(outcome, conclude)
             self._heartbeat.clean_up()
             outcome, conclude = None, None
@@ -109,7 +109,7 @@ class Worker:
             log(f"trial {trial.number} is requeued: {limit}")
             self._heartbeat.requeue()
         except FolderInUseError as error:
-            # Another process still delivers what an attempt before has left.
+            # Another process still uploads what an earlier attempt has left.
             log(f"trial {trial.number}: {error}")
             self._heartbeat.requeue()
             time.sleep(WAIT_S)
@@ -118,7 +118,7 @@ class Worker:
             raise
         except StorageUnavailableError:
             raise
-        # Any other error of a trial fails the trial, not the study; this process is told to leave in other ways.
+        # Any other error fails the trial, not the study; a request to leave does not arrive as an exception.
         except (Exception, SystemExit, KeyboardInterrupt) as error:
             line = one_line_message(error)
             if line is None:
@@ -137,7 +137,7 @@ class Worker:
         # By the trial's number: parallel workers draw different points, and a single worker is reproducible.
         seed = np.random.SeedSequence((phase.seed, trial.number)).generate_state(1)[0]
         trial.study.sampler = make("sampler", phase.sampler, BaseSampler, seed=int(seed))
-        # Of a new object each time: what the trial believes written may have been lost with the connection.
+        # A new object each time: writes that the trial has cached may have been lost with the connection.
         chosen = phase.scheduler.storage.transaction(lambda: phase.suggest(Trial(trial.study, trial._trial_id)))
         config, choices = compose_run([*self._overrides, *overrides_of(chosen)])
         folder = trial_folder(phase.folder, trial.number)
@@ -187,7 +187,7 @@ class Worker:
         reason = outcome.attributes.get(FAILURE)
         log(f"trial {trial.number} " + (f"failed: {reason}" if reason else f"{state.name.lower()} {shown}".rstrip()))
         if not reason:
-            # Not before: until the storage has its outcome, a trial may have to be resumed.
+            # Not earlier: until the storage has its outcome, the trial may have to be resumed.
             self._phase.remove_checkpoints(trial)
         if tracked is None:
             return

@@ -1,4 +1,4 @@
-"""Phantoms kept on disk, so that each is made once a machine."""
+"""Cache of phantoms on disk, so that each is made once per machine."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from armscan.volumes.mapped import SUFFIX, mapped_volume, open_mapped
 from armscan.volumes.phantom import generate, tube, varied, wrist
 from armscan.volumes.volume import LabelVolume
 
-# Environments that are made one by one share their phantoms; those that nobody has any more are forgotten.
+# Environments that are made one by one share their phantoms; unused ones are freed.
 _IN_MEMORY: WeakValueDictionary[Path, LabelVolume] = WeakValueDictionary()
 
 
@@ -25,11 +25,11 @@ def load_phantoms(seeds: Iterable[int], cache_dir: Path | None = None, version: 
     """Return the phantoms of the given seeds by name; see `load_phantom`."""
     wanted = list(seeds)
     with ThreadPoolExecutor() as threads:
-        # Those that are there are checked on all cores; held here until they are returned.
+        # Existing files are verified on all cores; `there` keeps their volumes alive until they are returned.
         there = list(threads.map(lambda seed: _opened(_path(seed, cache_dir, version)), wanted))
     known: Iterable[tuple[int, LabelVolume | None]] = [*zip(wanted, there, strict=True)]
     if None in there and sys.stdout.isatty():
-        # Deferred: it is needed once a machine.
+        # Deferred: needed once per machine.
         from rich.progress import track
 
         known = track(known, "making phantoms", total=len(wanted), transient=True)
@@ -38,11 +38,11 @@ def load_phantoms(seeds: Iterable[int], cache_dir: Path | None = None, version: 
 
 
 def load_phantom(seed: int, cache_dir: Path | None = None, version: int = 1) -> LabelVolume:
-    """Return the phantom of a seed, from the cache if it is there, made and kept otherwise.
+    """Return the phantom of a seed, from the cache if it is there; make and cache it otherwise.
 
     Args:
         seed: Seed of everything drawn; see `make_phantom`.
-        cache_dir: Folder that keeps phantoms. None: `$ARMSCAN_CACHE`, or else the user's cache folder.
+        cache_dir: Folder of the cache. None: `$ARMSCAN_CACHE`, or else the user's cache folder.
         version: Version of the anatomy; see `make_phantom`. Default: 1.
 
     Returns:
@@ -63,7 +63,7 @@ def load_phantom(seed: int, cache_dir: Path | None = None, version: int = 1) -> 
 
 
 def _opened(path: Path) -> LabelVolume | None:
-    """Return a phantom that this process has, or that its file holds."""
+    """Return a phantom from this process's memory, or from its file; None if neither has it."""
     volume = _IN_MEMORY.get(path)
     if volume is None and (found := open_mapped(path)) is not None:
         _IN_MEMORY[path] = volume = found[0]
@@ -77,7 +77,7 @@ def _path(seed: int, cache_dir: Path | None, version: int) -> Path:
 
 @cache
 def _generator_version() -> str:
-    """Fingerprint of the generator's sources, so that a changed generator never meets its old phantoms."""
+    """Return the fingerprint of the generator's sources, so that a change in them invalidates cached phantoms."""
     digest = hashlib.sha256()
     for module in (generate, tube, varied, wrist, plane, volume):
         digest.update(Path(str(module.__file__)).read_bytes())

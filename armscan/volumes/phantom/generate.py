@@ -1,4 +1,4 @@
-"""From a seed to a phantom volume: draws a wrist, poses it in the field of view, and labels the voxels."""
+"""Make a phantom volume from a seed: draw a wrist, pose it in the field of view, and label the voxels."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ SHAPE = (360, 800, 80)
 SPACING_MM = (0.27, 0.27, 0.55)
 N_STRAY_VOXELS = (150, 450)
 
-# What draws the anatomy, by version; what a version draws from a seed never changes.
+# Functions that draw the anatomy, by version; what a version draws from a seed never changes.
 VERSIONS = {1: draw_wrist, 2: draw_varied_wrist}
 
 
 class Pose(NamedTuple):
-    """Pose of a wrist in the field of view: (rz, rx) in degrees, its tunnel's middle, scale, left or right."""
+    """Pose of a wrist in the field of view: (rz, rx) in degrees, its tunnel's centre in mm, scale, left or right."""
 
     rotation: tuple[float, float]
     origin_mm: FloatArray
@@ -48,7 +48,7 @@ class Pose(NamedTuple):
         )
 
     def place(self, tube: Tube) -> Tube:
-        """Return the tube of a usual right hand as this hand has it."""
+        """Return a tube of the standard right hand, mirrored and scaled to this hand."""
         return (tube.mirror() if self.left else tube).scale(self.size)
 
     def optimal_action(self) -> ManipulatorAction:
@@ -69,8 +69,8 @@ def make_phantom(seed: int, version: int = 1) -> LabelVolume:
 
     Args:
         seed: Seed of everything drawn: anatomy, size, pose, side (left or right), stray voxels.
-        version: Version of the anatomy, one of `VERSIONS`. In version 1 the labelled plane lies at one place among
-            bones and tendons; in version 2 its place varies. Default: 1.
+        version: Version of the anatomy, one of `VERSIONS`. In version 1 the labelled plane has a fixed position among
+            bones and tendons; in version 2 its position varies. Default: 1.
 
     Returns:
         The volume, named `phantom-SEED`, or `phantom-v2-SEED` in version 2, with its optimal plane.
@@ -102,7 +102,7 @@ def phantom_name(seed: int, version: int) -> str:
 
 
 def _scatter_strays(labels: np.ndarray, rng: np.random.Generator) -> None:
-    """Label single background voxels at random, as slips of a segmenting hand do."""
+    """Label single background voxels at random, like slips in manual segmentation."""
     n_strays = rng.integers(*N_STRAY_VOXELS)
     where = tuple(rng.integers(0, n, n_strays) for n in labels.shape)
     strays = rng.integers(1, 4, n_strays).astype(np.uint8)

@@ -31,7 +31,7 @@ class Tube:
     def ovoid(
         cls, label: int, centre: tuple[float, float, float], radii: tuple[float, float, float], bluntness: float = 3.0
     ) -> Self:
-        """Return an egg about `centre` (x, y, z) with `radii` (x, y, z) in mm; a larger `bluntness` blunts its ends."""
+        """Return an ovoid with `centre` and `radii` (x, y, z) in mm; a larger `bluntness` blunts its ends."""
         x, y, z = centre
         heights = np.sin(np.linspace(-np.pi / 2, np.pi / 2, 17))
         width = (1 - np.abs(heights) ** bluntness) ** 0.5
@@ -63,14 +63,14 @@ class Tube:
         stretch: Sequence[float] = (1.0, 1.0, 1.0),
         thickness: Sequence[float] | FloatArray = (1.0, 1.0),
     ) -> Tube:
-        """Return the same tube elsewhere: its places times `stretch` (x, y, z), then moved; radii times `thickness`."""
+        """Return the tube with positions times `stretch` (x, y, z), then shifted, and radii times `thickness`."""
         nodes = self.nodes.copy()
         nodes[:, [X, Y, Z]] = nodes[:, [X, Y, Z]] * stretch + shift_mm
         nodes[:, [RADIUS_X, RADIUS_Z]] *= thickness
         return Tube(self.label, nodes)
 
     def between(self, low_mm: float, high_mm: float) -> Tube:
-        """Return the part of it from `low_mm` to `high_mm` along the arm; at least one node must lie between."""
+        """Return the part of the tube from `low_mm` to `high_mm` along the arm."""
         y = self.nodes[:, Y]
         ends = np.clip([low_mm, high_mm], y[0], y[-1])
         places = np.concatenate([ends[:1], y[(y > ends[0]) & (y < ends[1])], ends[1:]])
@@ -111,7 +111,7 @@ def fill_tube(
         y_low, y_high = nodes[segment, 0], nodes[segment + 1, 0]
         if y_high <= y_low:
             continue
-        # The box of voxels about the segment's two ellipses.
+        # The bounding box of the segment's two ellipses, in voxels.
         low = np.full(3, np.inf)
         high = np.full(3, -np.inf)
         for end in range(segment, segment + 2):

@@ -1,10 +1,10 @@
-"""Phantoms of version 2: wrists whose parts lie differently to each other and to the labelled plane.
+"""Phantoms of version 2: wrists whose parts vary in position relative to each other and to the labelled plane.
 
-Where the rows of the carpus end, how wide the gaps between them are, where tendons part and close up, and which of all
-this the labelled plane cuts, differs from one source of labelmaps to the next; in version 1 all of it is in one place,
-to a millimetre. Here parts of such a wrist are moved against each other along the arm, across and in depth, are
-stretched, bent, and grow thicker or thinner. What holds in all of them: the labelled plane cuts the four bones of the
-distal row, and lies about the middle of the stretch in which tendons run in three groups.
+Where the carpal rows end, how wide the gaps between them are, where tendons split and merge, and what the labelled
+plane cuts, differ between sources of labelmaps; in version 1 all of it is fixed to within a millimetre. Here the parts
+of such a wrist are shifted against each other along the arm, across and in depth, stretched, bent, thickened or
+thinned. In every one the labelled plane cuts the four bones of the distal row, and lies near the middle of the stretch
+in which tendons run in three groups.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from armscan.utils.arrays import FloatArray
 from armscan.volumes.phantom.tube import RADIUS_X, Tube, X, Y, Z
 from armscan.volumes.phantom.wrist import draw_parts
 
-# Of version 1, in mm along the arm: half of the distal row, middle and half of the proximal one, where the long bones
-# on either side begin, and where tendons are seen to part and to close up.
+# Of version 1, in mm along the arm: half length of the distal row, middle and half length of the proximal one, where
+# the long bones on either side begin, and where tendons split and merge.
 DISTAL_HALF, PROXIMAL_MIDDLE, PROXIMAL_HALF, HAND, FOREARM = 11.2, 18.3, 6.4, -14.3, 27.0
 TENDONS_PART, TENDONS_JOIN = -8.2, 6.6
 # The distal row ends no nearer to the labelled plane than this.
@@ -26,7 +26,7 @@ MIN_END_MM = 3.0
 
 
 def draw_varied_wrist(rng: np.random.Generator) -> list[Tube]:
-    """Draw the anatomy of one right wrist of version 2; bones come first, so that they stay whole."""
+    """Draw the anatomy of one right wrist of version 2; bones come first, so that nothing cuts into them."""
     parts = draw_parts(rng)
     bones = _bones(rng, parts)
     while not _are_cut_as_labelled(bones):
@@ -43,7 +43,7 @@ EVEN = np.ones(2)
 class _Place(NamedTuple):
     """Place and thickness of a part's tubes, as arguments of `Tube.arrange`.
 
-    `spread_mm` is the standard deviation (x, y, z) in mm by which each tube lies elsewhere than the others.
+    `spread_mm` is the standard deviation (x, y, z) in mm of each tube's own shift.
     """
 
     shift_mm: tuple[float, float, float]
@@ -52,7 +52,7 @@ class _Place(NamedTuple):
     spread_mm: tuple[float, float, float] = (0.3, 0.8, 0.6)
 
     def arrange(self, rng: np.random.Generator, tubes: list[Tube]) -> list[Tube]:
-        """Return the tubes in this place, each a little aside and of its own thickness."""
+        """Return the tubes in this place, each with a shift and thickness of its own."""
         return [
             tube.arrange(
                 shift_mm=rng.normal(self.shift_mm, self.spread_mm),
@@ -64,7 +64,7 @@ class _Place(NamedTuple):
 
 
 def _bones(rng: np.random.Generator, parts: dict[str, list[Tube]]) -> dict[str, list[Tube]]:
-    """Return all bones by part: rows of their own middles and lengths, long bones nearer to or further from them."""
+    """Return all bones by part: carpal rows of random position and length, long bones at random distances from them."""
     half, middle = rng.uniform(7.5, 12.5), rng.uniform(-7.0, 1.5)
     middle = max(middle, MIN_END_MM - half)
     proximal_start, proximal_half = middle + half + rng.uniform(-2.5, 1.5), rng.uniform(5.5, 8.5)
@@ -107,17 +107,17 @@ def _are_cut_as_labelled(bones: dict[str, list[Tube]]) -> bool:
 
 
 def _share_at_plane(tube: Tube) -> float:
-    """Return the width of a tube at the labelled plane as a share of its largest one."""
+    """Return the width of a tube at the labelled plane as a fraction of its largest width."""
     widths = tube.nodes[:, RADIUS_X]
     return float(np.interp(0.0, tube.nodes[:, Y], widths, left=0.0, right=0.0) / widths.max())
 
 
 def _tendons(rng: np.random.Generator, tendons: list[Tube]) -> list[Tube]:
-    """Return the tendons with a longer or shorter stretch of three groups, at whose ends a piece may be missing."""
+    """Return the tendons with a stretch of three groups of random length, at whose ends a piece may be missing."""
     half, thick = rng.uniform(7.5, 10.5), rng.uniform(0.88, 1.05)
     across, deep = rng.uniform(0.82, 1.05), rng.normal(0.0, 0.4)
     palm_mm, forearm_mm = rng.uniform(0.0, (1.5, 3.0)) * (rng.random(2) < (0.4, 0.7))
-    # The bundle in the forearm lies aside: from where it begins, or little by little.
+    # The forearm bundle is shifted sideways: within the gap before it, or gradually if there is none.
     aside_mm = rng.uniform(-4.0, 1.5)
     aside_from_to = (half, half + (forearm_mm or 15.0))
     ends_of_pieces = ((-90.0, -half - palm_mm), (-half, half), (half + forearm_mm, 180.0))
@@ -136,7 +136,7 @@ def _tendons(rng: np.random.Generator, tendons: list[Tube]) -> list[Tube]:
 
 
 def _vessel_and_nerve(rng: np.random.Generator, cords: list[Tube]) -> list[Tube]:
-    """Return artery and nerve nearer to the tendons or further from them, beginning elsewhere."""
+    """Return artery and nerve, shifted at random across, along the arm and in depth."""
     artery, nerve = cords
     return [
         artery.arrange(shift_mm=(rng.uniform(-5.5, 1.0), rng.uniform(-4.0, 3.0), rng.normal(0.0, 0.5))),
@@ -148,7 +148,7 @@ def _vessel_and_nerve(rng: np.random.Generator, cords: list[Tube]) -> list[Tube]
 
 
 def _bent(tube: Tube, hand: FloatArray, forearm: FloatArray) -> Tube:
-    """Return a tube of a hand and a forearm that lie at an angle to the carpus: tangents across and in depth."""
+    """Return a tube bent where hand and forearm leave the carpus, by the tangents of their angles (across, depth)."""
     nodes = tube.nodes.copy()
     beyond_mm = (np.minimum(nodes[:, Y] + 13.0, 0.0), np.maximum(nodes[:, Y] - 25.0, 0.0))
     for axis, of_hand, of_forearm in zip((X, Z), hand, forearm, strict=True):

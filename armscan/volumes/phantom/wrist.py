@@ -1,8 +1,8 @@
 """The anatomy of a phantom wrist: its bones, tendons, artery and nerve as tubes in the wrist's own frame.
 
-The frame is that of a right hand seen on its palm, in mm: X towards the ulna (thumb at negative x), Y along the arm
-(fingers at negative y), Z from the back of the hand to the palm. The carpal tunnel's plane is y = 0: it cuts the four
-bones of the distal carpal row with the hook of the hamate, the three tendon groups and the ulnar artery.
+The frame is a right hand's, in mm: X towards the ulna (thumb at negative x), Y along the arm (fingers at negative y), Z
+from the back of the hand to the palm. The carpal tunnel's plane is y = 0: it cuts the four bones of the distal carpal
+row with the hook of the hamate, the three tendon groups and the ulnar artery.
 
 Positions and sizes follow the proportions of an adult hand (Netter, Atlas of Human Anatomy, plates of the wrist and
 hand), simplified to what a labelmap at 0.3 mm shows.
@@ -27,12 +27,12 @@ JOINT_Y = (-78.0, -113.0, -117.0, -109.0, -93.0)
 
 
 def draw_wrist(rng: np.random.Generator) -> list[Tube]:
-    """Draw the anatomy of one right wrist, of usual size; bones come first, so that they stay whole."""
+    """Draw the anatomy of one right wrist of standard size; bones come first, so that nothing cuts into them."""
     return [tube for tubes in draw_parts(rng).values() for tube in tubes]
 
 
 def draw_parts(rng: np.random.Generator) -> dict[str, list[Tube]]:
-    """Draw the same by name, in the same order."""
+    """Draw the same anatomy by the name of each part, in the same order."""
     spread = rng.uniform(0.92, 1.08)
     return {
         "forearm": list(_forearm_bones(rng)),
@@ -46,7 +46,7 @@ def draw_parts(rng: np.random.Generator) -> dict[str, list[Tube]]:
 
 
 def _ovoid(rng: np.random.Generator, centre: tuple[float, float, float], radii: tuple[float, float, float]) -> Tube:
-    """Return a carpal bone, each of its figures varied a little."""
+    """Return a carpal bone, its position and radii varied a little."""
     x, y, z = np.array(centre) + rng.normal(0.0, (0.2, 0.5, 0.35))
     radius_x, radius_y, radius_z = np.array(radii) * rng.uniform(0.95, 1.04, 3)
     return Tube.ovoid(BONE, (x, y, z), (radius_x, radius_y, radius_z))
@@ -81,7 +81,7 @@ def _forearm_bones(rng: np.random.Generator) -> Iterator[Tube]:
 
 
 def _proximal_row(rng: np.random.Generator) -> Iterator[Tube]:
-    """Return scaphoid, lunate, triquetrum and, before it, the pisiform."""
+    """Return scaphoid, lunate, triquetrum and, palmar to it, the pisiform."""
     yield _ovoid(rng, (-16.0, 18.0, 1.0), (6.6, 6.6, 6.2))
     yield _ovoid(rng, (-2.5, 19.3, -1.0), (5.6, 6.2, 6.6))
     yield _ovoid(rng, (9.3, 18.3, -1.5), (4.9, 5.8, 5.2))
@@ -116,7 +116,7 @@ def _finger_bones(rng: np.random.Generator, spread: float) -> Iterator[Tube]:
 
 
 def _accessory_bones(rng: np.random.Generator) -> Iterator[Tube]:
-    """Return small bones on both sides of the carpus, before and behind the tunnel, which a tilted plane meets."""
+    """Return small bones on both sides of the carpus, distal and proximal to the tunnel, which a tilted plane cuts."""
     for x, z in ((-35.5, 10.0), (-36.0, -1.0), (27.0, 8.0), (27.5, -3.0)):
         yield _ovoid(rng, (x, -16.5, z), (2.8, 7.2, 3.4))
     for x, z in ((-32.0, 8.5), (-32.0, -3.0), (27.0, 6.0), (26.0, -5.0)):
@@ -132,8 +132,8 @@ def _beyond(joint: tuple[float, float, float]) -> tuple[float, float, float]:
 def _tendons(rng: np.random.Generator, spread: float) -> Iterator[Tube]:
     """Return five flexor tendons: one to each finger, three groups in the tunnel, bundles in the forearm.
 
-    Within the tunnel the thumb's runs with the index finger's and the ring finger's with the little finger's. On the
-    way to the forearm all close up into one bundle, which parts again, further up, into a deep and a superficial one.
+    Within the tunnel the thumb's runs with the index finger's and the ring finger's with the little finger's. Towards
+    the forearm all merge into one bundle, which splits again, further up, into a deep and a superficial one.
     """
     tunnel_x = (-11.0, -8.8, 0.0, 8.4, 10.6)
     palm_x = (-17.0, -9.5, -1.0, 7.0, 14.0)
@@ -173,7 +173,7 @@ def _tendons(rng: np.random.Generator, spread: float) -> Iterator[Tube]:
 
 
 def _vessel_and_nerve(rng: np.random.Generator) -> Iterator[Tube]:
-    """Return the ulnar artery, palmar of hook and pisiform, and the median nerve over the tendons."""
+    """Return the ulnar artery, palmar to hook and pisiform, and the median nerve, palmar to the tendons."""
     thick = rng.uniform(0.92, 1.12)
     x, z = rng.normal(0.0, 0.5), rng.normal(0.0, 0.3)
     yield Tube.cord(
