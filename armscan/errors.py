@@ -122,9 +122,9 @@ def is_interruption(error: BaseException | None) -> bool:
 
 
 def listed(allowed: Iterable[object]) -> str:
-    """Return the allowed values, joined for a message: 'a, b or c'."""
-    names = [str(value) for value in allowed]
-    return names[0] if len(names) == 1 else ", ".join(names[:-1]) + f" or {names[-1]}"
+    """Return the allowed values, joined for a message: 'a, b or c', or 'nothing'."""
+    *others, last = [str(value) for value in allowed] or ["nothing"]
+    return f"{', '.join(others)} or {last}" if others else last
 
 
 def few(names: Iterable[object], most: int = 4) -> str:

@@ -1,4 +1,4 @@
-"""Fixtures of many tests: volumes, arguments of environments, a folder for cached phantoms."""
+"""Fixtures shared by many tests: volumes, servers, databases, a browser and the commands."""
 
 import contextlib
 import json
@@ -16,7 +16,7 @@ from hypothesis import settings
 from armscan.utils.processes import limit_threads
 from tests.support.requirements import unavailable
 
-# As a run does: tests run on all cores already.
+# As in a run: the tests use all cores already.
 limit_threads()
 # A background job of a script ignores SIGINT, and so would all commands that the tests start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -28,7 +28,7 @@ settings.load_profile("armscan")
 DATA = Path(__file__).parent / "data"
 # Tests that start servers, clusters or browsers, or compare six real runs, are left to `make test-full`.
 FULL_FIXTURES = {"postgres_programs", "artifacts_disk", "cluster", "look", "browser", "runs"}
-# Fixtures that take seconds to make and are shared by a module: its tests that use one run on one worker.
+# Fixtures that take seconds to make, once per module: all tests of a module that use one run on the same worker.
 SHARED_FIXTURES = ("runs", "made", "server", "cluster")
 
 
@@ -92,7 +92,7 @@ def wrists(tmp_path, data_folder):
 
 @pytest.fixture(scope="session")
 def golden():
-    """Return what an independent implementation saw in slices of these labelmaps."""
+    """Return the results of an independent implementation for slices of these labelmaps."""
     with np.load(DATA / "golden" / "slices_full.npz") as arrays:
         return dict(arrays)
 
@@ -106,7 +106,7 @@ def phantom():
 
 @pytest.fixture(scope="session")
 def tiny_volume():
-    """Return a small block of every landmark, spaced differently along each axis."""
+    """Return a small volume with a block of every landmark, and a different spacing along each axis."""
     return make_tiny_volume()
 
 
@@ -150,7 +150,7 @@ def write_manifest(tmp_path):
 
 @pytest.fixture
 def unseen_windows():
-    """Let windows open that nobody sees; those that are left open are closed."""
+    """Make Matplotlib's windows invisible; close those that are left open."""
     from matplotlib import pyplot
 
     before = pyplot.get_backend()
@@ -162,7 +162,7 @@ def unseen_windows():
 
 @pytest.fixture
 def made_read_only():
-    """Make a folder one that nobody can write to for a while, not even root: mounted upon itself, read-only."""
+    """Make a folder read-only for a block, even for root: it is mounted onto itself."""
 
     @contextlib.contextmanager
     def read_only(folder):
@@ -208,7 +208,7 @@ def tracking_server(postgres, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def empty_database(tmp_path_factory):
-    """Return a database with MLflow's tables, which take a second or more to make."""
+    """Return an empty database with MLflow's tables, which take a second or more to create."""
     from armscan.tracking import open_store
 
     folder = tmp_path_factory.mktemp("store")
@@ -225,7 +225,7 @@ def database(tmp_path, empty_database):
 
 @pytest.fixture
 def browser(tmp_path):
-    """Chromium with a profile of its own."""
+    """Yield Chromium with an empty profile."""
     from tests.support.browser import chromium, programs
 
     if programs() is None:
@@ -236,7 +236,7 @@ def browser(tmp_path):
 
 @pytest.fixture
 def armscan(tmp_path, monkeypatch, capsys):
-    """Run `armscan` in this process, in an empty folder; return its exit code and what it printed."""
+    """Run `armscan` in this process, in an empty folder; return its exit code, standard output and standard error."""
     from armscan.cli.main import main
 
     def command(*words, cwd=tmp_path):
@@ -251,7 +251,7 @@ def armscan(tmp_path, monkeypatch, capsys):
 
 @pytest.fixture
 def answer(tmp_path, monkeypatch, capsys):
-    """Run the command in this process, in an empty folder; return its exit code and what it printed."""
+    """Run `armscan.run` in this process, in an empty folder; return its exit code and standard error."""
     from hydra.core.global_hydra import GlobalHydra
 
     from armscan import run

@@ -20,7 +20,7 @@ ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.glob("*.md"))]
 NOTEBOOKS = sorted((DOCS / "notebooks").glob("*.ipynb"))
-# In the place of what a user fills in.
+# Values for the placeholders that a user fills in.
 PLACEHOLDERS = {
     "FOLDER": ".",
     "RUN_ID": "0123abcd",
@@ -140,7 +140,7 @@ def test_tutorial_runs_as_it_stands(data_folder, tmp_path, monkeypatch, capsys):
 
 
 def armscan(words, folder):
-    """Run armscan in a process of its own, in a folder."""
+    """Run armscan in its own process, in a folder."""
     command = [sys.executable, "-P", "-m", "armscan", *words]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)

@@ -22,7 +22,7 @@ from tests.test_run import SMALL
 REPOSITORY = Path(armscan.__file__).parents[1]
 BUILT_FROM = ("pyproject.toml", "hatch_build.py", "README.md", "LICENSE", "CHANGELOG.md", "armscan", "conf", "sweeps")
 PRIVATE = ("conf/local/services.yaml", "conf/agent/private.yaml", "sweeps/private.yaml", "conf/notes.txt")
-# Where the configuration is, and what is composed of each list of words.
+# Composes each list of words, and prints where the configuration is.
 COMPOSE = """
 import json, sys
 from armscan.config.compose import compose
@@ -66,7 +66,7 @@ def test_every_config_and_every_sweep_composes(path, monkeypatch):
 
 
 def run(*command, cwd, **given):
-    # What is installed is to be found, and not the repository.
+    # So that the installed package is found, and not the repository.
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
     words = [str(word) for word in command]
     ended = subprocess.run(words, cwd=cwd, env=environment, capture_output=True, text=True, check=False, **given)
@@ -82,10 +82,10 @@ def build(checkout, target, folder):
 
 
 def virtual_environment(folder, *installed):
-    """Make an environment with nothing but what is installed, beside armscan's dependencies; return its Python."""
+    """Make a virtual environment with these packages and armscan's dependencies alone; return its Python."""
     run(sys.executable, "-m", "venv", "--without-pip", folder, cwd=folder.parent)
     (packages,) = folder.glob("lib/python3*/site-packages")
-    # Of a folder that a .pth file names, other .pth files are not read: those of an editable armscan.
+    # In a folder that a .pth file names, other .pth files are not read, such as those of an editable armscan.
     (packages / "dependencies.pth").write_text(sysconfig.get_path("purelib"))
     python = folder / "bin" / "python"
     pip = ("-m", "pip", "--quiet", "--disable-pip-version-check", "--python", python, "install")

@@ -1,4 +1,4 @@
-"""The command, as a person types it."""
+"""The command, as a user types it."""
 
 import json
 import os
@@ -33,15 +33,15 @@ SMALL = [
     # It takes longer than the training.
     "tracking.policy=false",
 ]
-# Of an agent that learns nothing.
+# For an agent that does not learn.
 FEW = [word for word in SMALL if word.startswith(("data.", "evaluation.", "env."))]
-# Figures that no two runs share.
+# Metrics that no two runs share.
 TIMES = ("wall_s", "speed/", "system/")
 REPOSITORY = Path(__file__).parent.parent
 
 
 def armscan_run(*arguments, cwd, **environment):
-    """Run the command in a process of its own."""
+    """Run the command in its own process."""
     return subprocess.run(
         [sys.executable, "-m", "armscan.run", *arguments],
         cwd=cwd,
@@ -99,7 +99,7 @@ def test_run_trains_evaluates_and_tracks(tmp_path, monkeypatch):
     assert steps == sorted(set(steps))
     assert steps[-1] >= 400
     artifacts = {file.path for file in client.list_artifacts(tracked.info.run_id)}
-    # Where the code is not that of its commit, beside them what differs.
+    # And a diff, if the code differs from its commit.
     assert artifacts - {"code.diff"} == {
         *("best.pt", "last.pt", "config.yaml", "volumes.json", "environment.json"),
         *("episode.gif", "evaluation.json", "baselines.json", "results.html", "learning_curve.png", "policy"),
@@ -368,7 +368,7 @@ def test_interrupted_run_is_closed_as_killed(tmp_path, multirun):
 
     def n_at_work():
         lines = (tmp_path / "printed").read_text().splitlines()
-        # What stands before the lines of a job, by which it is known.
+        # Counted by the prefix of each line, which names its job.
         told = Counter(line.partition("]")[0][:3] for line in lines if "/500000 steps" in line)
         return sum(count >= 2 for count in told.values()) if multirun else min(1, sum(told.values()) // 2)
 
@@ -377,7 +377,7 @@ def test_interrupted_run_is_closed_as_killed(tmp_path, multirun):
     assert process.wait(HANG_S) == 130
     output = (tmp_path / "printed").read_text()
     assert output.rstrip().endswith("interrupted")
-    # Where the signal finds compiled code, that library may still print where it was; it is no job's failure.
+    # If the signal interrupts compiled code, its library may still print where it was; no job has failed.
     assert "failed" not in output
     tracked = runs_in(tmp_path)[1]
     assert {each.info.status for each in tracked} == {"KILLED"}, [each.data.tags.get("failure") for each in tracked]
@@ -407,7 +407,7 @@ def test_job_that_is_ended_takes_no_other_with_it(tmp_path, ending, line):
     def are_tracked():
         return all(label in (tmp_path / "printed").read_text() for label in ("[0 seed=0]", "[1 seed=1]"))
 
-    # Each of them may be killed.
+    # Both are running, and either may be killed.
     wait_until(are_tracked, process=process, log=(tmp_path / "printed").read_text)
     os.kill(job_process_ids(process.pid)[0], ending)
     assert process.wait(HANG_S) == 1
@@ -420,9 +420,9 @@ def test_job_that_is_ended_takes_no_other_with_it(tmp_path, ending, line):
 
 
 def job_process_ids(launcher_pid):
-    """Return the processes of a multirun's jobs: children of the launcher's workers, or of itself on one core."""
+    """Return the process IDs of a multirun's jobs: children of the launcher's workers, or of itself on one core."""
     listing = subprocess.run(["ps", "-ewwo", "pid=,ppid=,args="], capture_output=True, text=True, check=True).stdout
-    # Of a program in several lines, ps makes one.
+    # ps prints a program of several lines on one.
     processes = [line.split(maxsplit=2) for line in listing.splitlines()]
     parents = {int(pid): int(parent) for pid, parent, *_ in processes}
     jobs = [int(pid) for pid, _, *program in processes if "run_job(" in " ".join(program)]

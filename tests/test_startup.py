@@ -8,12 +8,12 @@ import pytest
 
 LEARNING = {"torch", "tianshou", "ray", "tensorboard", "pettingzoo"}
 HEAVY = LEARNING | {"mlflow", "optuna", "matplotlib", "pandas", "plotly", "scipy.stats", "sqlalchemy"}
-# Runs one command after another, and says their exit codes and what is loaded afterwards.
+# Runs commands one after another, then prints their exit codes and the imported modules.
 PROGRAM = """
 import os, sys
 from armscan.cli.main import main
 def code(words):
-    # Set by the command before, which a process has only one of.
+    # Set by the command before; usually a process runs only one.
     os.environ.pop("HYDRA_FULL_ERROR", None)
     try:
         return main(words.split())
@@ -25,7 +25,7 @@ print(*sys.modules)
 
 
 def after(folder, *commands):
-    """Return the exit codes of commands in a fresh process, what they said, and which modules it has loaded."""
+    """Return the exit codes of commands in a fresh process, their standard error, and the modules it has imported."""
     ran = subprocess.run(
         [sys.executable, "-c", PROGRAM, *commands], cwd=folder, capture_output=True, text=True, check=True
     )

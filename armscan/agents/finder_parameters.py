@@ -45,7 +45,7 @@ class FinderParameters:
     n_averaged: int = 1
     """Number of latest looks whose estimates are averaged, weighted by the inverse squares of their expected errors; at
     most the number of looks. The next look is placed beside their mean; the answer is the mean. 1: the latest estimate
-    alone, as always in training.
+    alone, with which the network is always trained.
     """
 
     average_tilts: bool = True
@@ -79,7 +79,7 @@ class FinderParameters:
     """Angle error, in degrees, above which the smooth L1 loss is linear; twice as large for the first look."""
 
     loss_across_mm: float = number(6.0, above=0.0, at_most=100.0)
-    """Error across of the slice's middle, in mm, above which the smooth L1 loss is linear."""
+    """Error of the slice's middle across, in mm, above which the smooth L1 loss is linear."""
 
     astray_share: float = number(0.3, at_least=0.0, at_most=1.0)
     """Share of the training looks that are perturbed at random, by some mm and degrees."""

@@ -30,7 +30,7 @@ fast_njit = cached_njit(
 
 
 class Weights(NamedTuple):
-    """Weights of a network, their gradient, and Adam's state, shape (n,); `steps` has shape (n_parameters,)."""
+    """Weights of a network, their gradient, and Adam's state, shape (n,); `steps` has one number per tensor."""
 
     values: Floats
     gradient: Floats

@@ -29,7 +29,7 @@ class EvenUpdatesTrainer(OffPolicyTrainer):
         self._learning_starts = learning_starts
 
     def _update_step(self, collect_stats: CollectStatsBase) -> TrainingStats:
-        """Take the gradient steps that are due since the last collection; return their statistics."""
+        """Take the gradient steps that are due since the previous collection; return their statistics."""
         collector = self.params.training_collector
         n_env_steps = collector.collect_step - self._learning_starts
         n_due = self._n_due(n_env_steps) - self._n_due(n_env_steps - collect_stats.n_collected_steps)

@@ -1,4 +1,4 @@
-"""The learner of the plane finder: teaches a network on the looks that it comes to by itself."""
+"""The learner of the plane finder: trains a network on the looks that it chooses itself."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from armscan.envs.vector_env import reset_each
 from armscan.errors import InvalidValueError
 from armscan.utils.arrays import FloatArray
 
-# What the names of phantoms begin with.
+# Prefix of the names of phantoms.
 PHANTOM = "phantom-"
-# Looks led astray: spreads in mm and degrees between which each is drawn, in orders of magnitude.
+# Perturbed looks: range of the standard deviations, in mm and degrees, which are drawn log-uniformly.
 ASTRAY_MM, ASTRAY_DEG = (0.5, 6.0), (1.0, 8.0)
-# How much larger the scales of the loss are for the first look: normal, normal, along it, across.
+# Factors on the loss thresholds for the first look: normal, normal, along it, across.
 FIRST_LOOK = (2.0, 2.0, 5.0, 1.0)
-# Weight of the second head's loss, beside the first's.
+# Weight of the second head's loss relative to the first's.
 EXPECTED_ERROR_WEIGHT = 0.1
 # Episodes that the expected errors are calibrated on.
 N_CALIBRATION = 96
@@ -47,6 +47,7 @@ class PlaneFinderLearner(SupervisedLearner):
     def __init__(self, finder: FinderParameters, setup: AgentSetup) -> None:
         self._finder, self._has_stop = finder, len(setup.action_names) > 4
         envs = setup.make_envs(finder.num_envs)
+        self._env_steps_per_update = envs.num_envs * finder.n_looks
         torch.manual_seed(setup.seed)
         space: Any = setup.observation_space
         network = LookNetwork(
@@ -71,14 +72,14 @@ class PlaneFinderLearner(SupervisedLearner):
         super().__init__(module, finder.lr, envs, setup)
         self._calibration_envs = setup.make_validation_envs and setup.make_validation_envs(N_CALIBRATION)
         self.expected_error: tuple[float, float] | None = None
-        """Expected error of the plane that `act` chose last, in mm and degrees."""
+        """Expected errors of the plane that `act` chose last, in mm and degrees."""
         self.expected_errors: FloatArray = np.empty((0, 2))
-        """The same of the planes that `act_all` chose last in each of its episodes, shape (n, 2)."""
+        """Expected errors of the planes that `act_all` chose last in each episode, shape (n, 2)."""
 
     @property
     def env_steps_at_once(self) -> int:
         """All looks of an episode in each environment."""
-        return int(self._envs.num_envs * self._finder.n_looks)
+        return self._env_steps_per_update
 
     def _learn_until(self, n_env_steps: int, seeds: list[int], rng: np.random.Generator) -> list[Tensor]:
         """See `SupervisedLearner._learn_until`."""
@@ -86,11 +87,11 @@ class PlaneFinderLearner(SupervisedLearner):
         while self._n_env_steps < n_env_steps:
             observations, _ = reset_each(self._envs, None if losses else seeds, self._volumes(rng, self._envs.num_envs))
             losses.append(self._teach(observations, rng))
-            self._n_env_steps += self.env_steps_at_once
+            self._n_env_steps += self._env_steps_per_update
         return losses
 
     def _volumes(self, rng: np.random.Generator, n_episodes: int) -> dict[str, Any] | None:
-        """Draw the volume of each episode where phantoms have a share of them; None leaves that to the environments."""
+        """Draw the volume of each episode by `phantom_share`; None leaves the choice to the environments."""
         phantom_share, names = self._finder.phantom_share, self._labelled_envs.rules.names
         groups = [[name for name in names if name.startswith(PHANTOM) == of_phantoms] for of_phantoms in (True, False)]
         if phantom_share is None or not all(groups):
@@ -115,7 +116,7 @@ class PlaneFinderLearner(SupervisedLearner):
         loss = len(seen) * nn.functional.smooth_l1_loss(place / scale, wanted / scale, reduction="none").mean(0).sum()
         off = (place - wanted).detach()
         errors = torch.stack([off[:, 2].abs(), torch.rad2deg(off[:, :2].norm(dim=1))], dim=1)
-        # The likelihood of errors that are distributed exponentially about their mean.
+        # Negative log-likelihood of errors from an exponential distribution with this mean.
         expected_error_loss = (expected.log() + errors / expected).mean()
         self._set_lr(finder.lr_after(self._n_env_steps, self._total_env_steps))
         self._optimiser.zero_grad()
@@ -124,7 +125,7 @@ class PlaneFinderLearner(SupervisedLearner):
         return loss.detach()
 
     def _next_looks(self, seen: dict[str, Tensor], offset_mm: float, rng: np.random.Generator) -> FloatArray:
-        """Return the next looks beside the planes found so far, some of them led astray, as actions that never stop."""
+        """Return the next looks beside the planes found so far, some of them perturbed, as actions that never stop."""
         n = self._envs.num_envs
         draws = torch.as_tensor(rng.normal(size=(n, 4)), dtype=torch.float32, device=self._device)
         spreads = np.exp([rng.uniform(math.log(low), math.log(high), n) for low, high in (ASTRAY_DEG, ASTRAY_MM)])
@@ -142,7 +143,7 @@ class PlaneFinderLearner(SupervisedLearner):
         return np.column_stack([actions, np.full(n, -1.0)]) if self._has_stop else actions
 
     def _further_metrics(self, seed: int) -> dict[str, float]:
-        """Scale the expected errors to be right on average on the validation volumes; return the metrics there."""
+        """Calibrate the expected errors to be right on average on the validation volumes; return the metrics there."""
         envs = self._calibration_envs
         if envs is None:
             return {}
@@ -179,10 +180,10 @@ class PlaneFinderLearner(SupervisedLearner):
         return looks_of(observations, self._device)
 
     def begin(self, *, seed: int, bounds: ActionBounds) -> None:
-        """Learn that an episode begins, in which nothing is drawn.
+        """Begin an episode, in which nothing is drawn.
 
         Raises:
-            InvalidValueError: If actions mean other planes than in training.
+            InvalidValueError: If the bounds, and so the meaning of actions, differ from training.
         """
         given, known = (*bounds.rotation_deg, *bounds.translation_mm), self._module.geometry.bounds.tolist()
         if not np.allclose(given, known, atol=1e-3):
@@ -206,7 +207,7 @@ class PlaneFinderLearner(SupervisedLearner):
         self.expected_errors = np.full((len(seeds), 2), np.nan)
 
     def act_all(self, observations: Observed, rewards: FloatArray, episodes: NDArray[np.int64]) -> FloatArray:
-        """See `BatchAgent.act_all`; one by one, because convolutions of a larger batch are not the same to the bit."""
+        """See `BatchAgent.act_all`; one by one, because convolutions of a larger batch differ in the last bits."""
         actions = []
         for row, (episode, reward) in enumerate(zip(episodes.tolist(), rewards.tolist(), strict=True)):
             actions.append(self.act(rows_of(observations, row), reward))

@@ -28,7 +28,7 @@ class StepCollector(Collector[CollectStats]):
     """Tianshou's collector, which collects steps of Gaussian policies as arrays, with the same result to the bit.
 
     Tianshou makes some 7,000 Python calls for a step of all environments, most of them for a `Batch` that is made only
-    to be copied into the replay buffer. `_is_plain` holds the full condition for collecting arrays.
+    to be copied into the replay buffer. `collect` and `_is_plain` decide when arrays are used.
 
     Args:
         policy: Policy that chooses the actions.

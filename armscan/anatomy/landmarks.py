@@ -112,7 +112,7 @@ def tissue_dice(slice_xz: NDArray[np.uint8], reference_xz: NDArray[np.uint8]) ->
 def nerve_area_error(
     slice_xz: NDArray[np.uint8], reference_xz: NDArray[np.uint8], pixel_mm: tuple[float, float]
 ) -> tuple[float | None, float | None]:
-    """Return the absolute error of the median nerve's area against a reference slice: in mm2, and in per cent of it.
+    """Return the absolute error of the median nerve's area against a reference slice's: in mm2, and in per cent of it.
 
     Args:
         slice_xz: Labels of the slice, indexed [across, depth].

@@ -205,7 +205,8 @@ def landmark_reward(clusters: TissueClusters, targets: Sequence[int] = PUBLISHED
         targets: Target counts: clusters of bones, tendons and artery that the wanted plane shows.
 
     Raises:
-        InvalidValueError: If `targets` is not three whole numbers from 1 to 1000, or `clusters` no `TissueClusters`.
+        InvalidValueError: If `targets` is not three whole numbers from 1 to 1000, or `clusters` is not a
+            `TissueClusters`.
     """
     if not isinstance(clusters, TissueClusters):
         raise InvalidValueError(f"clusters is {clusters!r}, but it must be a TissueClusters")

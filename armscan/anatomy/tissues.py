@@ -111,7 +111,7 @@ PIXEL_TISSUES = Tissues(
     PixelTissue(label=3, eps_px=1.1, min_samples=4),
 )
 
-# Finds the same as the pixel mode at its own spacing, and at any other with pixels of up to about 0.55 mm.
+# Finds what the pixel mode finds at its own spacing, and the same at any other with pixels of up to about 0.55 mm.
 METRIC_TISSUES = Tissues(
     MetricTissue(label=1, eps_mm=1.6, density=0.94),
     MetricTissue(label=2, eps_mm=1.2, density=0.62),

@@ -53,7 +53,7 @@ def label(request: LabellingOptions) -> tuple[list[tuple[LabelVolume, FoundPlane
 
     Returns:
         The volumes, with the plane that each had before, and their planes now in the manifest; and an error for each
-        volume without a plane.
+        volume in which no plane was found.
     """
     dataset = open_dataset(request.data, require_manifest=False)
     volumes = _wanted(request, dataset)
@@ -71,7 +71,7 @@ def label(request: LabellingOptions) -> tuple[list[tuple[LabelVolume, FoundPlane
         except OptimalPlaneError as error:
             failures.append(error)
             continue
-        # The manifest last: every plane in it then has a picture.
+        # The manifest last: no plane is written into it without a picture.
         _make_folder(request.pictures)
         _write_picture(request.pictures / f"{name}.png", volume, plane.action, request.tissues)
         if request.markups:

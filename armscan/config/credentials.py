@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,11 +14,14 @@ from armscan.errors import InvalidValueError
 if TYPE_CHECKING:
     from sqlalchemy import URL
 
-# Of the database with the studies; of a database with runs; of an MLflow server, as MLflow itself reads it.
+# Of the studies' database, of a database with runs, and (read by MLflow itself) of an MLflow server.
 STORAGE_PASSWORD = "ARMSCAN_STORAGE_PASSWORD"
 TRACKING_PASSWORD = "ARMSCAN_TRACKING_PASSWORD"
 SERVER_PASSWORD = "MLFLOW_TRACKING_PASSWORD"
-# A variable of this name holds a file's path instead, as containers are given their secrets.
+SERVER_SECRETS = (SERVER_PASSWORD, "MLFLOW_TRACKING_TOKEN")
+# Read by the clients of PostgreSQL.
+PGPASSWORD = "PGPASSWORD"
+# With this suffix, a variable holds the path of a file with the password, as containers receive secrets.
 FILE_SUFFIX = "_FILE"
 # USER:PASSWORD@, where the password of a database may contain a slash; or an option such as sslpassword=.
 PASSWORD = re.compile(
@@ -39,7 +43,7 @@ def check_address(name: str, uri: str) -> None:
     if uri.startswith("http"):
         instead = f"set MLFLOW_TRACKING_USERNAME and {SERVER_PASSWORD}"
     else:
-        variable = STORAGE_PASSWORD if "storage" in name.split()[0].lower() else TRACKING_PASSWORD
+        variable = STORAGE_PASSWORD if "storage" in name.partition(" ")[0].lower() else TRACKING_PASSWORD
         instead = f"put it in ~/.pgpass or the file that PGPASSFILE names, or set {variable}"
     raise InvalidValueError(f"{name} has a password in its address, where others could read it: {instead}")
 
@@ -83,10 +87,12 @@ def database_url(uri: str, variable: str) -> URL:
 
 
 def mask_passwords(text: str) -> str:
-    """Return a string, such as a library's error, without the passwords of this process and of any address in it."""
+    """Mask passwords in a string, such as a library's error: of addresses, the environment and its files."""
     text = ACCOUNT.sub(rf"\1:{MASK}@", text)
-    for variable in (STORAGE_PASSWORD, TRACKING_PASSWORD, SERVER_PASSWORD):
-        password = os.environ.get(variable, "")
-        if len(password) >= MIN_MASKED_CHARS:
-            text = text.replace(password, MASK)
+    for variable in (STORAGE_PASSWORD, TRACKING_PASSWORD, *SERVER_SECRETS, PGPASSWORD):
+        # Of a file that cannot be read, nobody has the password.
+        with suppress(InvalidValueError):
+            password = read_password(variable)
+            if password is not None and len(password) >= MIN_MASKED_CHARS:
+                text = text.replace(password, MASK)
     return text

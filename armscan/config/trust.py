@@ -1,8 +1,8 @@
 """Code that a stored configuration or command line may execute.
 
 Hydra builds objects by the names of their classes, so a configuration is a program. What this user typed is trusted.
-What comes from a store or a run's folder may be anybody's: of its classes only armscan's own are built, and nothing
-else in it is computed, unless the user says `--trust`.
+What comes from a store or a run's folder may be anybody's: without `--trust`, only armscan's own classes are built from
+it, and interpolations are refused.
 """
 
 from __future__ import annotations
@@ -13,24 +13,25 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
+from armscan.config.credentials import SERVER_SECRETS
 from armscan.config.defaults import default_tracking
 from armscan.config.legacy import migrate
 from armscan.config.sources import config_folder, sweeps_folder
 from armscan.errors import UntrustedError
 
 TRUST = "--trust"
-SERVER_SECRETS = ("MLFLOW_TRACKING_PASSWORD", "MLFLOW_TRACKING_TOKEN")
 HOW = f"if you trust its author, repeat the command with {TRUST}"
 TARGET, INTERPOLATION = "_target_", "${"
 TARGETS = re.compile(rf"{TARGET}: *([\w.]+)")
-# Of grids and studies, not of the runs in them.
-GROUPS_OF_COMMANDS = ("hydra", "study", "local")
+SERVER = re.compile(r"(?<![\w+.-])(?!sqlite:)[\w+.-]+://")
+# Of grids and studies; the configuration of a run names none of their classes.
+GROUPS_OF_COMMANDS = ("hydra", "study")
 PACKAGES_OF_COMMANDS = ("armscan.launch.", "armscan.sweeps.")
 
 
 @functools.cache
 def offered_classes() -> frozenset[str]:
-    """Return the names of the classes and functions that armscan's own configuration builds runs of."""
+    """Return the names of the classes and functions that armscan's own configuration builds runs from."""
     root = config_folder()
     files = [path for path in root.rglob("*.yaml") if path.relative_to(root).parts[0] not in GROUPS_OF_COMMANDS]
     names = {
@@ -47,7 +48,7 @@ def stored_config(config: Mapping[str, Any], *, where: str, trust: bool) -> dict
     Args:
         config: Resolved configuration, as it was stored.
         where: Owner of the configuration, such as `run 3bf2`, for the error.
-        trust: Whether the configuration may name classes that armscan does not offer, as `--trust` says.
+        trust: Whether the configuration may name classes that armscan does not offer (`--trust`).
 
     Raises:
         UntrustedError: If it names a class that armscan does not offer, or holds an interpolation.
@@ -59,7 +60,7 @@ def stored_config(config: Mapping[str, Any], *, where: str, trust: bool) -> dict
 
 
 def needs_trust(config: Mapping[str, Any]) -> bool:
-    """Return whether a run of this configuration, or of these MLflow parameters, is read with `--trust` only."""
+    """Return whether a run with this configuration, or these MLflow parameters, can be read only with `--trust`."""
     return _foreign_part(migrate(config)) is not None
 
 
@@ -87,13 +88,14 @@ def untrusted_word(words: Sequence[str], uri: str) -> str | None:
         uri: Address of the store that keeps them.
     """
     for word in words:
-        key, _, value = word.lstrip("+~").partition("=")
-        # Hydra takes the value in quotes, too.
+        # Hydra removes the backslash of an escaped colon or brace.
+        plain = word.replace("\\", "")
+        key, _, value = plain.lstrip("+~").partition("=")
+        # Hydra also accepts a quoted value.
         value = value.strip("'\"")
         # A server is sent this user's password.
-        is_server = "://" in value and not value.startswith("sqlite:")
-        is_elsewhere = key.startswith("tracking.") and is_server and value != uri
-        if is_elsewhere or TARGET in word or INTERPOLATION in word or key.startswith(("hydra", "-")):
+        is_elsewhere = value != uri and SERVER.search(value) is not None
+        if is_elsewhere or TARGET in plain or INTERPOLATION in plain or "hydra" in key or key.startswith("-"):
             return word
     return None
 

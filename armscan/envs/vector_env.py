@@ -168,7 +168,7 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
         return self.rules.observe_all([episode.view for episode in episodes])
 
     def _infos(self, episodes: Sequence[Episode], is_given: Mask) -> dict[str, Any]:
-        """Return `info` as arrays, with a mask `_key` for each of the environments that have it, as in Gymnasium."""
+        """Return `info` as arrays, each `key` with a mask `_key` of the environments that have it, as in Gymnasium."""
         given = [episode for episode, is_its in zip(episodes, is_given, strict=True) if is_its]
         infos: dict[str, Any] = {}
         for key in self.info_keys:

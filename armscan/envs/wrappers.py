@@ -37,7 +37,7 @@ ONLY = np.array([0])
 
 
 class _Remembering(gym.Wrapper[Any, FloatArray, Any, FloatArray], RecordConstructorArgs):
-    """A wrapper that adds an episode's history to the observation, of a batch of one environment."""
+    """A wrapper that adds an episode's history, kept as for a batch of one environment, to the observation."""
 
     def __init__(self, env: Env, remembered: Remembered, **arguments: Any) -> None:
         RecordConstructorArgs.__init__(self, **arguments)

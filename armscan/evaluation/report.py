@@ -139,7 +139,7 @@ class EvaluationReport:
 
 
 def report_tables(report: EvaluationReport, width: int) -> list[Table | Text]:
-    """Return the tables to print after the results: each volume of each group, and further figures.
+    """Return the tables to print besides the results: each volume of each group, and further figures.
 
     Args:
         report: Report to show.

@@ -39,7 +39,7 @@ TITLES = {
     LAST_VALIDATION: f"agent, {LAST_VALIDATION}",
     TRAINING: "agent, training",
 }
-# Every evaluation tracks this metric, below the name of its group; `NAMES` maps these names to those of the volumes.
+# Every evaluation tracks this metric, below the name of its group; `NAMES` maps groups to the names of their volumes.
 EVALUATED = "/success_rate"
 NAMES = {name.replace(" ", "_"): name for name in (TEST, TRAINING)} | {"validation": LAST_VALIDATION}
 # Metrics of a run's MLflow model, besides the on-plane rates.

@@ -29,7 +29,7 @@ def best_of(runs: Sequence[Run]) -> Run | None:
 
 
 def show_best(store: TrackingStore, parent_id: str, jobs: Sequence[Run]) -> None:
-    """Log the leading figures of the best job and its random agent to the run of a grid, under the names of its jobs'.
+    """Log the leading figures of the best job and its random agent to the run of a grid, under the same names.
 
     Jobs of different folds have different test volumes, so none of them is the best.
     """

@@ -12,7 +12,7 @@ from armscan.config.compose import compose
 from armscan.config.defaults import FOLD, FOLDS, MULTIRUN
 
 # What may set `data.folds`.
-MAY_SET_FOLDS = (f"{FOLDS}=", f"+{FOLDS}=", "experiment=", "+experiment=")
+MAY_SET_FOLDS = (f"{FOLDS}=", "experiment=")
 
 
 def with_folds(words: Sequence[str]) -> list[str]:
@@ -26,20 +26,20 @@ def with_folds(words: Sequence[str]) -> list[str]:
     """
     overrides = [word for word in words if not word.startswith("-")]
     options = [word for word in words if word.startswith("-")]
-    if set(options) - set(MULTIRUN) or not any(word.startswith(MAY_SET_FOLDS) for word in overrides):
+    if set(options) - set(MULTIRUN) or not any(word.lstrip("+").startswith(MAY_SET_FOLDS) for word in overrides):
         return list(words)
     try:
         parsed = OverridesParser.create().parse_overrides(overrides)
-        # What the grid varies anyway says nothing of its folds.
+        # Overrides that the grid varies are left out: they do not set its folds.
         data = compose([each.input_line for each in parsed if each.input_line and not each.is_sweep_override()]).data
         folds, fold, path = data.get("folds"), data.get("fold"), data.get("path")
         n_volumes = data.get("n_volumes")
-    # Hydra answers it, or the run.
+    # Hydra or the run reports it.
     except (HydraException, OmegaConfBaseException):
         return list(words)
     if folds is None or fold is not None or any(each.key_or_group == FOLD for each in parsed):
         return list(words)
-    # Deferred: a mistake on the command line should be answered before they are loaded.
+    # Deferred: command-line errors are reported before these are loaded.
     from armscan.training.subject_splits import n_folds
     from armscan.volumes.dataset import subjects_in
 

@@ -1,4 +1,4 @@
-"""One job of a multirun, in a process of its own, started by the launcher's."""
+"""One job of a multirun, in its own process, started by the launcher's."""
 
 from __future__ import annotations
 
@@ -21,19 +21,21 @@ ENDINGS = (signal.SIGINT, signal.SIGTERM)
 
 
 def start_job(config: DictConfig, invocation: Invocation, job: Job) -> None:
-    """Run a job in a process of its own.
+    """Run a job in its own process.
 
-    One that is killed, for its memory say, takes neither the launcher nor the other jobs with it.
+    If it is killed, for example out of memory, the launcher and the other jobs continue.
     """
     job.write_outcome(failure=NO_OUTCOME)
     command = child_command(__name__, run_job.__name__)
     ended = subprocess.run(command, input=pickle.dumps((config, invocation)), check=False)
     if ended.returncode < 0:
-        job.write_outcome(failure=f"killed by {signal.Signals(-ended.returncode).name}: out of memory?")
+        killed_by = signal.Signals(-ended.returncode)
+        question = ": out of memory?" if killed_by == signal.SIGKILL else ""
+        job.write_outcome(failure=f"killed by {killed_by.name}{question}")
 
 
 def run_job(launcher_pid: int) -> None:
-    """Run one job of a multirun, passed on standard input; a failure is noted and does not stop the others.
+    """Run one job of a multirun, passed on standard input; a failure is recorded and does not stop the others.
 
     Args:
         launcher_pid: Process ID of its launcher.
@@ -43,12 +45,12 @@ def run_job(launcher_pid: int) -> None:
     job: Job = invocation.job
 
     def leave(*_: object) -> None:
-        """End the job at once: raised inside compiled code, an interrupt can come out as any other error."""
+        """End the job at once, without an exception, which compiled code can turn into any other error."""
         job.write_outcome(failure=INTERRUPTED)
         os._exit(130)
 
     def end(**outcome: Any) -> None:
-        """Write the outcome; an interrupt that comes later changes nothing."""
+        """Write the outcome, and ignore later interrupts."""
         for ending in ENDINGS:
             signal.signal(ending, signal.SIG_IGN)
         job.write_outcome(**outcome)

@@ -32,7 +32,7 @@ POLICY_TAG = "policy"
 KEPT = "kept"
 # Run tag with the SHA-256 of the model, by which a replaced model is detected.
 SUM_TAG = "policy.sha256"
-# Largest difference of the model from its network; and from the learner and ONNX, which sum in other orders.
+# Largest allowed difference of the model from its network; and from the learner and ONNX, which sum in other orders.
 TOLERANCE, ROUNDING_TOLERANCE = 1e-6, 1e-5
 # First seed of the episodes that the observations come from, above those of evaluations; and number of observations.
 FIRST_SEED, N_OBSERVED = 6 * 10**6, 8

@@ -40,12 +40,16 @@ def _run_row(group: Group, training: TrackedTraining) -> Row:
         "run": training.id,
         "name": training.name,
         "group": group.name,
-        "seed": training.seed if training.seed is not None else "",
+        **_seed_and_fold(training),
         "status": training.status,
         "environment steps": "" if math.isnan(training.env_steps) else int(training.env_steps),
         "training, s": "" if math.isnan(training.wall_s) else round(training.wall_s),
         "not kept": ", ".join(training.missing),
     }
+
+
+def _seed_and_fold(training: TrackedTraining) -> Row:
+    return {"seed": training.seed or "", "fold": training.fold or ""}
 
 
 def _curve_rows(groups: Sequence[Group], curves: Curves) -> Iterator[Row]:
@@ -59,7 +63,8 @@ def _seed_rows(groups: Sequence[Group]) -> Iterator[Row]:
     for group in groups:
         for training in group.trainings:
             for figure, series in training.series.items():
-                of_series = {"group": group.name, "run": training.run_id, "seed": training.seed, "figure": figure}
+                of_training = {"group": group.name, "run": training.run_id, **_seed_and_fold(training)}
+                of_series = {**of_training, "figure": figure}
                 for env_steps, wall_s, value in zip(series.env_steps, series.wall_s, series.values, strict=True):
                     yield {**of_series, "env_steps": int(env_steps), "wall_s": wall_s, "value": value}
 
@@ -76,7 +81,8 @@ def _volume_rows(groups: Sequence[Group]) -> Iterator[Row]:
     for group in groups:
         for training in group.trainings:
             for volume, figures in metrics_by_volume(training).items():
-                yield {"group": group.name, "run": training.run_id, "seed": training.seed, "volume": volume, **figures}
+                of_training = {"group": group.name, "run": training.run_id, **_seed_and_fold(training)}
+                yield {**of_training, "volume": volume, **figures}
 
 
 def _pair_rows(groups: Sequence[Group], pairs: Mapping[str, Sequence[Pair]]) -> Iterator[Row]:

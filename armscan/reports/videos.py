@@ -42,7 +42,7 @@ def videos(groups: Sequence[Group]) -> str:
 
 
 def _median(group: Group) -> TrackedTraining | None:
-    """Return the median training, by mean steps, of those with a video; one without an evaluation only if all are."""
+    """Return the median training, by mean steps, of those with a video; an unevaluated one only if all are."""
     recorded = [training for training in group.trainings if training.video is not None]
     ranked = sorted((each for each in recorded if each.evaluation), key=_mean_steps) or recorded
     return ranked[(len(ranked) - 1) // 2] if ranked else None

@@ -1,4 +1,4 @@
-"""Selection of runs in a store, and the options that select them."""
+"""Selection of runs in a store."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def find(
         where: MLflow filter string.
 
     Raises:
-        InvalidValueError: If there is no such experiment, or MLflow does not take the filter.
+        InvalidValueError: If there is no such experiment, or MLflow rejects the filter.
         TrackingError: If there is no such parent.
     """
     experiments = experiment_ids(client, experiment)
@@ -73,14 +73,14 @@ def find(
 
 
 def _projection_params(text: str) -> tuple[str, ...]:
-    """Return projections as parameters of runs have them."""
+    """Return projections as they are written in the parameters of runs."""
     if text.startswith("["):
         return (json.dumps([part.strip() for part in text.strip("[]").split(",")]),)
-    return tuple(text.split(","))
+    return tuple(part.strip() for part in text.split(","))
 
 
 def experiment_ids(client: TrackingStore, name: str | None = None) -> list[str]:
-    """Return the ids of all experiments of a store, or of the one of a name, which must exist."""
+    """Return the IDs of all experiments of a store, or of the one with this name, which must exist."""
     experiments = all_pages(client.search_experiments)
     found = [each.experiment_id for each in experiments if name in (None, each.name)]
     if not found and name is not None:

@@ -30,7 +30,8 @@ def run_study(arguments: Sequence[str], launch: Callable[[Sequence[str]], object
     """Run a study, or show what it would run.
 
     Returns:
-        The exit code: 0 if there is a result, or the study was stopped or only shown; 130 if interrupted; else 1.
+        The exit code: 0 if there is a result, or the study was stopped or only shown; 130 if interrupted; 75 if its
+        workers gave up, and the same command resumes it; else 1.
     """
     given = StudyCommand.read(arguments)
     silence_libraries()

@@ -252,7 +252,7 @@ class TrackedRun:
 
         Args:
             status: Status: FINISHED, FAILED or KILLED.
-            reason: Why the run failed or was interrupted. Default: None, it did not.
+            reason: Why the run failed or was interrupted. Default: None, no reason is recorded.
             wait_s: Seconds to wait for an unavailable store. Default: None, `wait_s` of the store.
 
         Returns:

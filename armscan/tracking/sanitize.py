@@ -49,7 +49,7 @@ def name_of(key: str) -> str:
 
 
 def shortened(text: str, at_most: int, whole_in: str) -> str:
-    """Return a string of at most `at_most` characters; a truncated one ends with the file that has all of it."""
+    """Return a string of at most `at_most` characters; a truncated one ends by naming the file with all of it."""
     if len(text) <= at_most:
         return text
     # The checksum distinguishes strings that begin alike.

@@ -99,7 +99,7 @@ def _is_abandoned(run_id: str, file: Path) -> bool:
 
 
 def _end_removed(run_id: str, opened: Callable[[str], TrackingStore]) -> str | None:
-    """Close a run as FAILED: its process died and its folder was removed; return why the store refuses, if it does."""
+    """Close a run as FAILED: its process died and its folder was removed; return why that is impossible, if it is."""
     note = Note.of(run_id)
     assert note is not None
     try:

@@ -64,8 +64,8 @@ class EpisodeResult:
             in mm². Default: None, not measured, or no nerve on the labelled plane's slice.
         nerve_area_error_percent: The same error as a percentage of the area on the labelled plane's slice. Default:
             None, as above.
-        expected_mm: Error of the last plane that the agent predicts, in mm. Default: None, it predicts none.
-        expected_deg: Error of the last plane that the agent predicts, in degrees. Default: None, it predicts none.
+        expected_mm: Error that the agent predicts for its last plane, in mm. Default: None, it predicts none.
+        expected_deg: Error that the agent predicts for its last plane, in degrees. Default: None, it predicts none.
     """
 
     volume: str

@@ -113,7 +113,7 @@ def _result(episode: Episode, seed: int, seconds: float, expected: Sequence[floa
         episode: Finished episode.
         seed: Seed of its reset.
         seconds: Wall time of all its steps, in seconds.
-        expected: Errors of the last plane that the agent predicts, in mm and degrees, or None and None.
+        expected: Errors that the agent predicts for its last plane, in mm and degrees, or None and None.
     """
     # The first reward is the start's.
     _, *rewards = episode.rewards

@@ -21,7 +21,7 @@ from armscan.training.metrics import MetricEstimates
 from armscan.utils.markdown import markdown_table
 from armscan.utils.rate_text import formatted
 
-# Most results that are columns side by side; of more, each is a line.
+# Maximum number of results that are columns side by side; with more, each is a line.
 MAX_ABREAST = 6
 # Characters between two columns.
 PADDING_CHARS = 2

@@ -29,7 +29,7 @@ class Split:
         test: Volumes of the final evaluation, which are not used in training.
 
     Raises:
-        InvalidValueError: If one of the three has no volume, or two have the same.
+        InvalidValueError: If one of the three has no volume, or two have the same volume, or copies of it.
     """
 
     training: dict[str, LabelVolume]
@@ -51,6 +51,18 @@ class Split:
                 if name in seen:
                     raise InvalidValueError(f"{name} is in {seen[name]} and in {part}, but it must be in one split")
                 seen[name] = part
+        self._check_copies()
+
+    def _check_copies(self) -> None:
+        seen: dict[str, tuple[str, str]] = {}
+        for part, prints in self.fingerprints().items():
+            for name, each in prints.items():
+                other, its_part = seen.setdefault(each, (name, part))
+                if part != its_part:
+                    raise InvalidValueError(
+                        f"{name} ({part}) is a copy of {other} ({its_part}), but a wrist must be in one split: give "
+                        "both the same subject in the manifest, or remove one"
+                    )
 
     @property
     def parts(self) -> dict[str, dict[str, LabelVolume]]:

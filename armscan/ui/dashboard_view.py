@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from wsgiref.types import StartResponse, WSGIApplication, WSGIEnvironment
 
 STUDIES = re.compile(r"/api/studies(/\d+)?")
-# The address in notes that link to runs in a local store, which no MLflow server tracks.
+# The address in notes that link to runs in a local store, which no MLflow server serves all the time.
 LOCAL_RUNS = re.compile(rf"http://127\.0\.0\.1:{MLFLOW_PORT}(?=/#/)")
 # Attributes that identify trials of armscan.
 OF_TRIAL = {names.LEASE, names.CONFIG_SHA256, names.FINALIST}

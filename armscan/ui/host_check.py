@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 if TYPE_CHECKING:
     from wsgiref.types import StartResponse, WSGIApplication, WSGIEnvironment
 
-# `Sec-Fetch-Site` of requests from other sites, which browsers send without asking the server first.
+# `Sec-Fetch-Site` of requests from other origins, some of which browsers send without asking the server first.
 FROM_ELSEWHERE = ("cross-site", "same-site")
 SAFE_METHODS = ("GET", "HEAD")
 # Headers for files that anybody may have put into a study: no script in them runs, and no type is guessed.
@@ -18,7 +18,7 @@ ARTIFACTS, SANDBOX = "/artifacts/", (("Content-Security-Policy", "sandbox"), ("X
 
 
 class HostCheck:
-    """WSGI middleware that refuses requests for other hosts and from other sites, and sandboxes artifacts.
+    """WSGI middleware that refuses requests for other hosts and from other origins, and sandboxes artifacts.
 
     Without it, any web page could read and delete studies, by DNS rebinding. MLflow's server has the same check.
 

@@ -45,7 +45,7 @@ RESULTS = (
 # Tags of a run with the SHA-256 of what it was started with.
 SHA256_TAGS = {CONFIG_FILE: "config.sha256", VOLUMES_FILE: "volumes.sha256"}
 LOCK_FILE = ".lock"
-# The outbox, a folder in a run's folder for what is still to be tracked.
+# The folder of a run's outbox, in the run's folder.
 OUTBOX_FOLDER = "tracking"
 # Of the files of a run's outbox, named after the run: the delivered position, the lock, and the entries.
 OUTBOX_SUFFIXES = (".delivered.json", ".lock", ".jsonl")
@@ -101,7 +101,7 @@ def _place(path: Path, *, follow_link: bool) -> Path:
 
 @contextlib.contextmanager
 def named_if_full(path: Path) -> Iterator[None]:
-    """Name the file in the error of a full disk, which has a name of its own only if opening a file raised it.
+    """Name the file in the error of a full disk, which itself names one only if opening a file raised it.
 
     Args:
         path: File, or folder of several files.

@@ -83,7 +83,7 @@ def process_start(pid: int) -> str:
     """Return the start time of a process, which tells it from a later one with the same ID, however the clock is set.
 
     Returns:
-        The time in seconds; an empty string if there is no such process, or only a zombie.
+        The time in seconds, as a string; an empty one if there is no such process, or only a zombie.
     """
     try:
         process = psutil.Process(pid)

@@ -80,7 +80,7 @@ class RetryPolicy:
                 reason, cause = told, error
         # After one timeout nothing is retried any more: cleanup would take as long again.
         self._is_over = True
-        long = f"{self._retry_s:g} s" if self._retry_s < 60 else f"{self._retry_s / 60:g} minutes"
+        long = f"{self._retry_s:g} s" if self._retry_s < 120 else f"{self._retry_s / 60:g} minutes"
         raise self._error(f"{self._named}, but it has been unavailable for {long}: {reason}") from cause
 
     @contextmanager

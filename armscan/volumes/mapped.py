@@ -143,8 +143,10 @@ def _make_room(kept: Path) -> None:
         if n_bytes <= limit:
             break
         if file != kept:
-            file.unlink(missing_ok=True)
-            n_bytes -= size
+            # In a shared folder, another user's may stay.
+            with contextlib.suppress(OSError):
+                file.unlink(missing_ok=True)
+                n_bytes -= size
 
 
 def limit_bytes() -> float:

@@ -66,9 +66,9 @@ def write_markup(path: str | Path, volume: LabelVolume, action: ManipulatorActio
 def read_markup(path: str | Path, volume: LabelVolume) -> ManipulatorAction:
     """Read the plane of a markups file, written by `write_markup` or drawn in Slicer, in LPS or RAS.
 
-    The result is the same plane as a set of points. A rectangle of a slice's size keeps its position across; any other
-    is centred on the volume. The rectangle's rotation within its plane and its position in depth are dropped: an action
-    has no such components.
+    The result is the same plane as a set of points. A rectangle of a slice's size keeps its position across; otherwise
+    the slice is centred on the volume across. A rectangle's rotation within its plane and its position in depth are
+    dropped: an action has no such components.
 
     Args:
         path: File with one plane; it may hold other markups.

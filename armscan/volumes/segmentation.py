@@ -63,7 +63,9 @@ def read_segmentation(
     _check_strays(segments, counts, labels, path)
     found = tuple(Found(each.name, each.label, counts[each.layer].get(each.value, 0)) for each in segments)
     if len(layers) == 1:
-        table = dict.fromkeys(counts[0], BACKGROUND) | {each.value: each.label for each in segments}
+        # A value that does not occur may be none that the voxels can have.
+        table = dict.fromkeys(counts[0], BACKGROUND)
+        table |= {each.value: each.label for each in segments if each.value in table}
         return replaced(layers[0], table), contents["ijkToLPS"], found
     return _merged(layers, segments, overlap, path), contents["ijkToLPS"], found
 

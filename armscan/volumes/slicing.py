@@ -128,7 +128,7 @@ def _sample(
         pixels[pixel] = 0
     inside = np.empty((2 * N_ROWS, 2), dtype=np.int64)
     along = np.arange(n_depth).astype(np.float64)
-    # A slice's voxels are scattered over memory: those of the next rows are prefetched before the last ones are read.
+    # A slice's voxels are scattered over memory: the next rows' are prefetched before the previous rows' are read.
     for first in range(0, n_across + N_ROWS, N_ROWS):
         if first < n_across:
             ends = _lines(axes, first * s_x), _lines(axes, (min(first + N_ROWS, n_across) - 1) * s_x)

@@ -151,7 +151,7 @@ class LabelVolume:
 
     @cached_property
     def labelled_clearance(self) -> float:
-        """Largest error in the labelled plane's matrix and offset that leaves its slice unchanged; see `clearance`."""
+        """Error of the labelled plane's matrix and offset that surely leaves its slice unchanged; see `clearance`."""
         plane = self.optimal_action
         assert plane is not None
         return clearance(self.spacing, plane.matrix, plane.offset_mm, self.slice_shape)

@@ -1,12 +1,12 @@
-"""Measure how far from the labelled plane a slice can be at full reward, which limits how near an agent comes.
+"""Measure how far from the labelled plane a slice can be at full reward, which limits the accuracy of agents.
 
     python -m benchmarks.learning.distance FOLDER
 
-Around the labelled planes of 12 phantoms that no reward was fitted to, 1,000 planes each: the slice's centre moved
-within +-10 mm along the labelled normal, both angles turned within +-20 degrees, uniformly. Of those that a reward
-takes for the wanted plane, that is, that score above -success_threshold: their share, and the median of their
-distances. `its own plane` is no reward for unseen wrists, but the best that its features could do: fitted to the
-labelled plane of the very phantom that is judged.
+Draws 1,000 planes around the labelled plane of each of 12 phantoms that no reward was fitted to: the slice's centre is
+moved by up to 10 mm along the labelled normal, both angles turned by up to 20 degrees, uniformly. Prints for each
+reward the share of planes that it accepts, that is, that score above -success_threshold, and the median of their
+distances. `its own plane` is not possible for unseen wrists, but the best that the features could do: it is fitted to
+the labelled plane of the very phantom that is judged.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def near_planes(volume: LabelVolume, rng: np.random.Generator) -> list[Manipulat
 def distances_of_accepted(
     volumes: list[LabelVolume], rewards: dict[str, tuple[Callable[[LabelVolume], Reward], float]]
 ) -> dict[str, list[tuple[float, float] | None]]:
-    """Return for each reward the distance (mm, degrees) of every plane that it takes for the wanted one, else None."""
+    """Return for each reward the distance (mm, degrees) of every plane that it accepts, None for the other planes."""
     distances = {name: [] for name in rewards}
     rng = np.random.default_rng(0)
     for volume in volumes:

@@ -1,14 +1,15 @@
-"""Compare how near the labelled plane the agents of runs come with the error that they expect.
+"""Measure how near the labelled plane the agents of runs come, and compare that with the error they expect.
 
     python -m benchmarks.learning.nearness RUN [FOLDER | phantom] [--tracking URI] [--episodes N] [--rx DEG]
                                            [--averaged N]
     python -m benchmarks.learning.nearness GRID ...
 
-Medians and 90th percentiles of the distance and the angle, how often both are within 1.5 mm and 4 degrees, over all
-volumes and for each; and, for an agent that says how far off it expects to be (`agent=plane_finder`), the errors by
-decile of that. Volumes: a folder, or 12 phantoms that no run trains on; default: the run's own test volumes. Of a
-grid (`data.folds`) all runs, each on its own test volumes. `--rx` turns volumes by up to as many degrees about the axis
-across, as `env.transform.rx_deg` does. `--averaged` sets `agent.n_averaged`, which changes no gradient step.
+Prints medians and 90th percentiles of distance and angle, and how often both are below 1.5 mm and 4 degrees, over all
+volumes and for each. For an agent that estimates its own error (`agent=plane_finder`), also prints the errors by decile
+of that estimate. Volumes: a folder, or 12 phantoms that no run trains on; default: the run's own test volumes. A grid
+(`data.folds`) plays all of its runs, each on its own test volumes. `--rx` turns volumes by up to that many degrees
+about the axis across, as `env.transform.rx_deg` does. `--averaged` sets `agent.n_averaged`, which changes no gradient
+step.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ NEAR_MM, NEAR_DEG = 1.5, 4.0
 
 
 def runs_of(tracking: str, run_id: str) -> list[str]:
-    """Return the IDs of a grid's runs, or that of the run itself."""
+    """Return the IDs of a grid's runs; for a single run, its own ID."""
     store = open_existing_store(tracking)
     run = find_run(store, run_id)
     children = store.children(run.info.experiment_id, run.info.run_id)
@@ -42,7 +43,7 @@ def runs_of(tracking: str, run_id: str) -> list[str]:
 def played(
     tracking: str, run_id: str, data: str | None, n_episodes: int, changes: Mapping[str, float | None]
 ) -> list[EpisodeResult]:
-    """Return the episodes of a run's agent on the volumes, with the changes of its configuration that are not None."""
+    """Return the episodes of a run's agent on the volumes; changes to its configuration that are None do not count."""
     subject = agent_of_run(tracking, run_id, {})
     for key, value in changes.items():
         if value is not None:
@@ -64,9 +65,9 @@ def print_row(name: str, episodes: Sequence[EpisodeResult]) -> None:
 
 
 def print_doubt(episodes: Sequence[EpisodeResult]) -> None:
-    """Print what the expected errors say, where there are any."""
+    """Print the errors by decile of the expected error, if the episodes have one."""
     for unit in ("mm", "deg"):
-        expected = np.array([getattr(each, f"expected_{unit}") or np.nan for each in episodes])
+        expected = np.array([getattr(each, f"expected_{unit}") for each in episodes], dtype=float)
         if np.isnan(expected).any():
             return
         errors = np.array([getattr(each, f"distance_{unit}") for each in episodes])

@@ -1,10 +1,11 @@
-"""Compare labelmaps and phantoms: places of bones, tendons, artery and nerve along the arm, from the labelled plane.
+"""Compare the anatomy of labelmaps and phantoms: positions of bones, tendons, artery and nerve along the arm.
 
     python -m benchmarks.learning.profiles FOLDER [--phantoms N]
 
-Every wrist is cut once a millimetre, parallel to its labelled plane, from 40 mm towards the fingers (negative) to 45 mm
-towards the elbow. For each landmark: its range in the folder, in N phantoms of each version (default: 64), and how
-many of the folder's wrists lie inside. Across, positive is ulnar, where the artery is; in depth, palmar.
+Every wrist is sliced every millimetre, parallel to its labelled plane, from 40 mm towards the fingers (negative) to
+45 mm towards the elbow. Prints for each landmark its range in the folder, its range in N phantoms of each version
+(default: 64), and how many of the folder's wrists lie inside the latter. Across, positive is ulnar, where the artery
+is; in depth, palmar.
 """
 
 from __future__ import annotations
@@ -22,14 +23,14 @@ from armscan.volumes.phantom import VERSIONS
 
 PLACES_MM = np.arange(-40, 46)
 BONE, TENDON, ARTERY, NERVE = 1, 2, 3, 4
-# Fewer pixels of a vessel or nerve are strays.
+# Fewer pixels of a tissue are strays.
 MIN_PIXELS = 12
 
 
 def profile(volume: LabelVolume) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return area (mm2) and mean place (across, depth, in mm) of each tissue, and numbers of tendons, along the arm.
+    """Return area (mm2) and mean position (across, depth, in mm) of each tissue, and number of tendon clusters.
 
-    Shapes: (n, 4), (n, 4, 2), (n,), for each of `PLACES_MM`; places are NaN where a tissue is absent.
+    Shapes: (n, 4), (n, 4, 2), (n,), for each of `PLACES_MM` along the arm; positions are NaN where a tissue is absent.
     """
     labelled = volume.optimal_action
     tx_mm, ty_mm = labelled.translation

@@ -1,16 +1,16 @@
-"""The published experiments again, drawn over their published learning curves.
+"""Repeat the published experiments, and draw their learning curves over the published ones.
 
     python -m benchmarks.learning.published [small|full] [folder=RUNS] [data=VOLUMES] [NAME ...]
 
-`small` (where nothing is said) stops each training after a few minutes; `full` takes as many environment steps as the
-preset says, hours for those of two degrees of freedom. NAMEs of presets, such as `published_sac_y_8`, run only these.
-With a folder of volumes, its first 1, 2 or 8 are trained on, otherwise as many phantoms. A run that has finished in the
-folder of runs is not repeated.
+`small` (default) stops each training after a few minutes; `full` takes the environment steps of the preset, hours for
+two degrees of freedom. NAMEs of presets, such as `published_sac_y_8`, run only these. Given a folder of volumes, runs
+train on its first 1, 2 or 8, otherwise on as many phantoms. A run that has finished in the folder of runs is not
+repeated.
 
 The published runs (2024, on real wrists, 80 cores and a V100) logged the mean length of the episodes that ended in each
-collection, while exploring. The same is drawn of ours: `train/length`, for each epoch. An episode there could be one
-step too long. "Reached" is the first step at which the mean of five successive points is at or below a length; their
-clock starts with their first point.
+collection, while exploring. Ours log the same as `train/length`, for each epoch. A published episode could be one step
+too long. "Reached" is the first step at which the mean of five successive points is at or below a length; the published
+clock starts at its first point.
 """
 
 from __future__ import annotations
@@ -96,11 +96,11 @@ class Curve:
     seconds: np.ndarray
 
     def smoothed(self) -> np.ndarray:
-        """Means of each point and those before it, five together. Shape (n,)."""
+        """Means of each point and up to four before it, shape (n,)."""
         return np.array([self.lengths[max(0, i + 1 - N_SMOOTHED) : i + 1].mean() for i in range(len(self.lengths))])
 
     def reached(self, length: float) -> tuple[int, float] | None:
-        """Environment steps and seconds until the smoothed length is at most `length`; None where it never is."""
+        """Environment steps and seconds until the smoothed length is at most `length`; None if it never is."""
         below = np.flatnonzero(self.smoothed()[N_SMOOTHED - 1 :] <= length)
         if not len(below):
             return None
@@ -129,7 +129,7 @@ def our_curve(name: str, overrides: list[str], folder: Path) -> Curve:
 
 
 def curves(name: str, *, is_full: bool, volumes: str | None, folder: Path) -> dict[str, Curve]:
-    """Return the published curve, the same settings here, and ours, by what they are called."""
+    """Return the published curve, ours with the same settings, and that of our preset, by their labels."""
     experiment = EXPERIMENTS[name]
     data = (
         [f"data.n_training={experiment.n_volumes}"]

@@ -1,12 +1,13 @@
-"""Evaluate trained agents on wrists that they have never seen, beside baselines that do not learn.
+"""Evaluate trained agents and baselines on unseen wrists.
 
     python -m benchmarks.learning.results data=VOLUMES [folder=RUNS] [seeds=0,1,2] [workers=2] [ROW ...]
     python -m benchmarks.learning.results show
 
-Every row is a preset (`conf/experiment`), trained on phantoms and on all volumes of the folder, once for each
-seed; judged in 300 episodes on 12 phantoms that it was not trained on, volumes moved at each reset, 50 steps at most.
-Of the rows named, or of all, what has not finished in the folder of runs yet is run, `workers` at a time; the figures
-are kept in `results.json` beside this script, and the table is printed. `show` prints it from there.
+A row is a preset (`conf/experiment`) or a baseline. Its training volumes are phantoms and all volumes of the folder; it
+is run once for each seed, and judged in 300 episodes on 12 phantoms that it was not trained on, which are moved at each
+reset, with 50 steps at most. The named rows (default: all) are run, `workers` at a time, unless they have finished in
+the folder of runs. Their figures are kept in `results.json` beside this script, and the table is printed. `show` only
+prints it.
 """
 
 from __future__ import annotations
@@ -88,7 +89,7 @@ ROWS = _presets() | _baselines()
 
 
 def figures_of(run: Run) -> dict[str, float]:
-    """Return what is kept of a run."""
+    """Return the figures of a run that are kept."""
     judged = run.evaluations[TEST]
     episodes = judged["episodes"]
     return {
@@ -105,9 +106,9 @@ def figures_of(run: Run) -> dict[str, float]:
 
 
 def measure(name: str, seed: int, data: str, folder: Path) -> None:
-    """Run a row with a seed, if that is still to be done, and keep its figures."""
-    # What a user says last holds: the data come after the preset.
+    """Run a row with a seed, unless that is done, and keep its figures."""
     overrides = [*ROWS[name].overrides, f"seed={seed}", *JUDGED]
+    # Presets set their own number of phantoms.
     if not ROWS[name].overrides[0].startswith("experiment="):
         overrides.append("data.n_training=64")
     run = finished_run(f"{name}-seed{seed}", [*MIXED, f"data.path={data}", *overrides], folder)
@@ -119,7 +120,7 @@ def measure(name: str, seed: int, data: str, folder: Path) -> None:
 
 
 def table() -> str:
-    """Return all that is kept as two Markdown tables: the figures of each seed, and the goals."""
+    """Return two Markdown tables of all kept figures: the figures of each seed, and the goals."""
     kept = json.loads(FIGURES.read_text())
     lines = [
         "| | median, mm | median, ° | mean steps | success, % | training, s | mean steps\\* | success\\*, % |",
@@ -173,6 +174,8 @@ def main(words: list[str]) -> None:
     }:
         sys.exit(f"{' '.join(unknown) or given}: see the text at the head of {__file__}; rows: {' '.join(ROWS)}")
     if "show" not in words:
+        if "data" not in given:
+            sys.exit(f"give data=FOLDER, or show: see the text at the head of {__file__}")
         folder = Path(given.get("folder", "benchmark-runs"))
         folder.mkdir(parents=True, exist_ok=True)
         seeds = [int(seed) for seed in given.get("seeds", "0,1,2").split(",")]

@@ -1,6 +1,6 @@
-"""Runs of `armscan.run` that benchmarks are made of, and what they left.
+"""Runs of `armscan.run` for benchmarks, and their results.
 
-A run that has finished is not repeated: its folder is read again. Remove the folder to have it anew.
+A run that has finished is not repeated: its folder is read again. Delete the folder to repeat the run.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from mlflow import MlflowClient
 
 from armscan.tracking import open_store
 
-# A folder to train on with phantoms beside it, judged on phantoms alone.
+# Trains on a folder and on phantoms; validates and tests on phantoms alone.
 MIXED = ("data=mixed", "data.validation=phantoms", "data.test=phantoms")
 CURVE = ("train/length", "train/length_max", "train/return", "train/return_min", "wall_s")
 
@@ -41,7 +41,7 @@ class Run:
 
     @cached_property
     def curve(self) -> dict[str, list[tuple[int, float]]]:
-        """(environment step, value) of each of `CURVE`, empty for agents that do not learn."""
+        """(environment step, value) pairs of each metric of `CURVE`; none for agents that do not learn."""
         client = MlflowClient(self.store)
         run_id = (self.folder / "run_id").read_text()
         return {

@@ -1,11 +1,11 @@
-"""Instructions and cache misses of the compiled code that looks at a plane, counted by Valgrind's cachegrind.
+"""Count instructions and cache misses of the compiled code that looks at a plane, with Valgrind's cachegrind.
 
     python -m benchmarks.speed.cache_misses [--planes N]
 
-Random planes of the default phantoms, in batches of 16, on one thread. One process ends without planes; what the others
-count above it is printed, per plane. They look slices up, or look at planes, clusters included. Cachegrind simulates a
-first level of 32 KiB and a last level of 32 MiB, without prefetches. Five processes of a minute each, on a quiet
-machine.
+Random planes of the default phantoms, in batches of 16, on one thread. A process looks slices up, or looks at planes,
+clusters included; another one ends without planes, and its counts are subtracted before dividing by the planes.
+Cachegrind simulates a first level of 32 KiB and a last level of 32 MiB, without prefetching. Takes five processes of a
+minute each on a quiet machine.
 """
 
 from __future__ import annotations
@@ -46,6 +46,8 @@ def main() -> None:
     if given.serve:
         serve(*given.serve)
         return
+    if given.planes < BATCH:
+        parser.error(f"--planes is {given.planes}, but it must be at least {BATCH}")
     scanner = Scanner(list(load_phantoms(range(4)).values()), PIXEL_TISSUES)
     print(f"| per plane | {' | '.join(COUNTED)} |\n| --- |{' ---: |' * len(COUNTED)}")
     idle = counts(scanner, "look", [])
@@ -58,7 +60,7 @@ def main() -> None:
 
 
 def draw_batches(volumes: Sequence[LabelVolume], projection: str, n_batches: int) -> list[Batch]:
-    """Return planes as random actions place them, in volumes that are moved as at resets."""
+    """Return the planes of random actions, in volumes that are moved as at resets."""
     # Not needed by the processes that are counted.
     from armscan.envs import RandomTransform
     from armscan.envs.actions import ActionBounds, free_components
@@ -82,7 +84,7 @@ def draw_batches(volumes: Sequence[LabelVolume], projection: str, n_batches: int
 
 def counts(scanner: Scanner, part: str, batches: list[Batch]) -> dict[str, int]:
     """Return what cachegrind counts in a process that looks at planes."""
-    # Valgrind's processor has another name, for which Numba would compile everything anew.
+    # Valgrind's processor has another name, for which Numba would recompile everything.
     numba_env = {"NUMBA_CPU_NAME": get_host_cpu_name(), "NUMBA_CPU_FEATURES": get_host_cpu_features()}
     with tempfile.TemporaryDirectory() as folder:
         path, given = Path(folder, "counts"), Path(folder, "given")
@@ -101,7 +103,7 @@ def counts(scanner: Scanner, part: str, batches: list[Batch]) -> dict[str, int]:
 
 
 def serve(part: str, given: str) -> None:
-    """Look at a first batch in each way, then at the others in one."""
+    """Look at a first batch in both ways, then at the others in one."""
     scanner, first, batches = pickle.loads(Path(given).read_bytes())
     arrays = numba.typed.List([(volume.labels_yxz, volume.occupied) for volume in scanner.volumes])
     spacings_mm = np.array([volume.spacing for volume in scanner.volumes])

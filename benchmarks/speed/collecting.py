@@ -1,10 +1,10 @@
-"""Measure the processor time of collecting beside Tianshou's own collector.
+"""Measure the processor time of collecting steps, compared with Tianshou's own collector.
 
     python -m benchmarks.speed.collecting [ROUNDS]
 
-Both collect 16 steps of 16 environments at a time, with the same policy, in turn in one process on one thread. What the
-environments take is measured within; the rest is the collector's: choosing actions, keeping transitions, statistics.
-The figures to quote are the ratios, medians over the rounds (default: 15).
+Both collect one step of each of 16 environments at a time, with the same policy, in turn in one process on one thread.
+The time of the environments is measured separately; the rest is the collector's: choosing actions, storing transitions,
+statistics. The figures to quote are the ratios, medians over the rounds (default: 15).
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def collectors(kind: Any, rules: dict[str, Any]) -> list[Collector[Any]]:
 
 
 def milliseconds(collector: Any) -> tuple[float, float]:
-    """Return the processor time of a collection, and of the environments in it."""
+    """Return the processor milliseconds of a collection, and of the environments in it."""
     collector.env.seconds, start_s = 0.0, time.process_time()
     with policy_within_training_step(collector.policy):
         for _ in range(N_COLLECTIONS):

@@ -3,8 +3,8 @@
     python -m benchmarks.speed.compiled_update [--before CHECKOUT] [--rounds N]
 
 Both learn from the same random steps on phantoms, batches of 256, each in a process of its own, on one thread.
-Tianshou's step is taken with the code of the checkout, or else with this one. The figures to quote are the ratios,
-medians over the rounds. A call takes as many compiled steps as follow a collection with the values of `agent=sac`.
+Tianshou's step runs the code of CHECKOUT (default: this one). The figures to quote are the ratios, medians over the
+rounds. A call takes as many compiled steps as `agent=sac` takes after a collection.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ COMPILED, TIANSHOU = "compiled", "Tianshou"
 
 
 def main() -> None:
-    """Print the table, or take gradient steps for another process that does."""
+    """Print the table, or take gradient steps for the process that prints it."""
     if sys.argv[1:] == ["--serve"]:
         serve()
         return
@@ -71,7 +71,7 @@ def serve() -> None:
 
 def measured(projection: str, hidden_sizes: tuple[int, ...], *, is_compiled: bool) -> Callable[[], int]:
     """Return a function that takes gradient steps, and returns their number."""
-    # Of the checkout that this process was started for.
+    # From the checkout that this process was started for.
     import torch
     from tianshou.algorithm.modelfree import sac
     from tianshou.utils.torch_utils import policy_within_training_step

@@ -1,11 +1,11 @@
-"""Measure steps a second of the environment beside a plain pipeline of public parts, in one run.
+"""Measure environment steps per second, compared with a plain pipeline of off-the-shelf parts, in one run.
 
     python -m benchmarks.speed.environment [FOLDER]
 
 Projection zy, volumes moved at each reset, the last 8 observations stacked, the best 4 actions remembered, random
 actions; resets are part of the time. The plain pipeline is what one would write first: SimpleITK resamples the whole
 volume with the plane's transform, a slice is cut from it, scikit-learn's DBSCAN clusters each tissue, and the same
-reward is computed. It sees planes that ours sees too and must give the same rewards.
+reward is computed. It must give the same rewards as ours.
 
 Everything is measured in turn, several times over. The figures to quote are the ratios, each the median over the
 rounds: they hold on a noisy machine where milliseconds do not.
@@ -42,7 +42,7 @@ RULES = {"projection": "zy", "rotation_bounds_deg": (90.0, 45.0), "stack": 8, "m
 
 
 def plain_reward(image: SimpleITK.Image, action: ManipulatorAction) -> float:
-    """Return the reward of a plane, by public parts alone."""
+    """Return the reward of a plane, by off-the-shelf parts alone."""
     transform = SimpleITK.AffineTransform(3)
     transform.SetMatrix(action.matrix.ravel())
     transform.SetTranslation(action.offset_mm)
@@ -63,7 +63,7 @@ def _clusters_by_sklearn(slice_xz: np.ndarray, tissue) -> Clusters:
 
 
 def one_environment(volumes: dict[str, LabelVolume] | list[LabelVolume], **changes) -> Callable[[], float]:
-    """Return what measures the seconds a step of one environment."""
+    """Return a function that measures the seconds per step of one environment."""
     env = gym.make(armscan.ENV_ID, volumes=volumes, disable_env_checker=True, **RULES | changes)
     env.action_space.seed(0)
     actions = [env.action_space.sample() for _ in range(N_STEPS)]
@@ -81,7 +81,7 @@ def one_environment(volumes: dict[str, LabelVolume] | list[LabelVolume], **chang
 
 
 def many_environments(volumes: dict[str, LabelVolume]) -> Callable[[], float]:
-    """Return what measures the seconds a step of one of many environments, all cores at work."""
+    """Return a function that measures the seconds per step of one of many environments, on all cores."""
     envs = gym.make_vec(armscan.ENV_ID, num_envs=NUM_ENVS, volumes=volumes, **RULES)
     envs.action_space.seed(0)
     actions = [envs.action_space.sample() for _ in range(N_VECTOR_STEPS)]
@@ -97,7 +97,7 @@ def many_environments(volumes: dict[str, LabelVolume]) -> Callable[[], float]:
 
 
 def plain_pipeline(volume: LabelVolume) -> Callable[[], float]:
-    """Return what measures the seconds a plane takes the plain pipeline; check that it gives our rewards."""
+    """Return a function that measures the plain pipeline's seconds per plane, and checks that it gives our rewards."""
     image = SimpleITK.GetImageFromArray(np.ascontiguousarray(volume.labels.transpose(2, 1, 0)))
     image.SetSpacing(volume.spacing)
     rng = np.random.default_rng(0)

@@ -1,12 +1,12 @@
-"""Measure evaluation of episodes side by side against the same episodes one by one, in one run.
+"""Measure the evaluation of episodes side by side against the same episodes one by one, in one run.
 
     python -m benchmarks.speed.evaluation [--before CHECKOUT] [PART-OF-A-NAME ...]
 
 Each agent plays a validation (48 episodes) or a final evaluation (200) on phantoms, one by one and side by side, in
-turn; the episodes must be the same to the bit. The first column is how policies were asked before: one by one, through
-Tianshou. Measured is the processor time of one core; the figures to quote are the ratios, each the median over the
-rounds. With `--before`, another process plays as many episodes with the code of that checkout, and an agent that it has
-trained itself.
+turn; the episodes must be bit-identical. The column `through Tianshou` is how policies were called before: with one
+observation at a time, by Tianshou. Times are processor time on one core; the figures to quote are the ratios to `side
+by side`, each the median over the rounds. With `--before`, another process plays as many episodes with the code of that
+checkout, and an agent that it has trained itself.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ CASES = {
 
 
 def made(env_factory: EnvFactory, algorithm, n_env_steps: int) -> Agent:
-    """Return an agent that has learned for as many environment steps."""
+    """Return an agent that has learned for this many environment steps."""
     volumes = load_phantoms(VOLUMES)
     env = env_factory.make_env(volumes)
     setup = AgentSetup(
@@ -77,7 +77,7 @@ def made(env_factory: EnvFactory, algorithm, n_env_steps: int) -> Agent:
 
 
 class ThroughTianshou:
-    """Asks a learner's policy as Tianshou does, one observation after another."""
+    """Calls a learner's policy as Tianshou does, with one observation at a time."""
 
     def __init__(self, learner: TianshouLearner) -> None:
         self._policy = learner._algorithm.policy
@@ -156,7 +156,7 @@ def measure(case: str, before: Callable[[str], list[float]] | None) -> str:
 
 
 def main() -> None:
-    """Print the table, or play episodes for another process that does."""
+    """Print the table, or play episodes for the process that prints it."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--before", type=Path, metavar="CHECKOUT", help="Another checkout to measure beside this one.")
     parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)

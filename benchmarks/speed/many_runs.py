@@ -2,7 +2,7 @@
 
     python -m benchmarks.speed.many_runs [--runs N] [--epochs N] [--before CHECKOUT]
 
-The runs are copies of a real, short one: its parameters, tags, metrics and files, with learning curves of so many
+The runs are copies of a real, short one: its parameters, tags, metrics and files, with learning curves of this many
 epochs (default: 200 runs, 20 epochs). They are read from a SQLite file and through an MLflow server on it. With
 `--before`, each process of this checkout follows one of the other, whose figures stand beside it.
 """
@@ -51,7 +51,7 @@ def armscan(checkout: Path, folder: Path, *words: str, uri: str) -> tuple[float,
 
 
 def copy_run(client: MlflowClient, folder: Path, *, n_runs: int, n_epochs: int) -> None:
-    """Copy the only run of a store into another experiment, each copy with another seed; three of a configuration."""
+    """Copy the only run of a store into another experiment, with three seeds of each configuration."""
     (run,) = client.search_runs(["1"])
     experiment_id = client.create_experiment("many", artifact_location=(folder / "many").as_uri())
     files = Path(client.download_artifacts(run.info.run_id, "", str(folder / "files")))

@@ -2,8 +2,8 @@
 
     python -m benchmarks.speed.memory [FOLDER]
 
-What is counted is what the volumes add: the memory with them, less that of the same environments on small volumes.
-Over a million steps, resets included, the memory of a process stays what it was after the first tenth of them.
+What the volumes add is the memory with them minus the memory of the same environments with small volumes. Over a
+million steps, resets included, the memory of a process should stay as it was after the first tenth.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def small_volumes() -> list[LabelVolume]:
 
 
 def bytes_when_stepping(volumes: Sequence[LabelVolume]) -> list[float]:
-    """Step environments until every volume has been seen; return the bytes that the process then holds."""
+    """Step environments until every volume has been used; return the bytes that the process then holds."""
     envs = make_armscan_vector_env(NUM_ENVS, volumes, **RULES)
     envs.reset(seed=0)
     envs.action_space.seed(0)

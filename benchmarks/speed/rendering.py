@@ -1,8 +1,8 @@
-"""Measure the pictures of an episode drawn a second, and a step with its picture beside one without.
+"""Measure frames rendered per second, and a step with and without rendering.
 
     python -m benchmarks.speed.rendering [FOLDER]
 
-The median over many frames, each of another plane: it says what a frame takes on a machine that does other things, too.
+Figures are medians over many frames, each of another plane: they hold on a machine that does other things, too.
 """
 
 from __future__ import annotations

@@ -1,14 +1,15 @@
-"""Measure memory and time of the replay of image observations beside a plain buffer, in one run.
+"""Measure memory and time of the replay buffer of image observations against a plain one, in one run.
 
     python -m benchmarks.speed.replay [FOLDER]
 
-Channels of 84 x 84, a stack of 4, the best 4 actions. Once actions are often so near the optimum that episodes take
-some two steps; once they are always beside it, where slices have much to show, and many episodes take all 50. Of each
-kind 10,000 transitions are played, and added again and again until the buffer is full; no frame is shared between one
-time and the next. Memory is the process's growth. The plain buffer is measured with fewer transitions and scaled.
+Channels of 84 x 84, a stack of 4, the best 4 actions. In short episodes, actions are often so near the optimum that an
+episode takes some two steps. In long ones, actions are always next to it, where slices show much, and many episodes
+take all 50 steps. Of each kind, 10,000 transitions are played, and added repeatedly until the buffer is full;
+repetitions share no frame. Memory is the growth of the process. The plain buffer is measured with fewer transitions,
+and scaled.
 
-A sampling is all that an update of SAC asks for: a batch, and once more its next observations. Both buffers are asked
-in turn and must give the same.
+A sampling is all that an update of SAC reads: a batch, and its next observations once more. Both buffers are sampled in
+turn and must return the same.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ DEFAULT_FOLDER = Path(__file__).parents[2] / "tests" / "data" / "volumes"
 N_ENVS, N_PLAYED, N_PLAIN, N_TRANSITIONS = 16, 10_000, 20_000, 1_000_000
 BATCH_SIZE, N_ROUNDS = 256, 101
 RULES = {"projection": "zy", "rotation_bounds_deg": (90.0, 45.0), "stack": 4, "memory": 4}
-# How often an action is near the optimum, from how far to how far in each component, and what ends an episode.
+# Share of actions near the optimum, their range of distances in each component, and rules that differ from `RULES`.
 NEAR_SHORT, NEAR_LONG = (0.5, (0.0, 0.05), {}), (1.0, (0.15, 0.3), {"success_threshold": 1e-3})
 
 
@@ -68,7 +69,7 @@ def batches(folder: str | Path, near: tuple) -> list[Batch]:
 
 
 def resident_bytes() -> int:
-    """Return the memory of this process after freed memory is given back, which would otherwise be reused unseen."""
+    """Return this process's memory once freed memory is given back, whose reuse would hide growth."""
     gc.collect()
     ctypes.CDLL(None).malloc_trim(0)
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
@@ -98,7 +99,7 @@ def filled(replay: Replay, steps: Iterable[Batch]) -> tuple[float, int]:
 
 
 def sampling_s(replay: Replay, seed: int) -> tuple[float, list[Batch]]:
-    """Return the seconds of all that an update asks for, and what it is given."""
+    """Return the seconds of a sampling, and the observations that it returns."""
     replay.seed(seed)
     start_s = time.perf_counter()
     batch, indices = replay.sample(BATCH_SIZE)
@@ -107,7 +108,7 @@ def sampling_s(replay: Replay, seed: int) -> tuple[float, list[Batch]]:
 
 
 def compared(image: Replay, to_plain: Replay, same: bool) -> tuple[float, float, float]:
-    """Return the median milliseconds of a sampling of each, and of their ratio; checks that both gave the same."""
+    """Return the median milliseconds of a sampling of each, and their median ratio; if `same`, check the samples."""
     rounds = []
     for seed in range(N_ROUNDS):
         (image_s, given), (plain_s, wanted) = sampling_s(image, seed), sampling_s(to_plain, seed)
@@ -120,13 +121,13 @@ def compared(image: Replay, to_plain: Replay, same: bool) -> tuple[float, float,
 
 
 def measure(folder: str | Path, name: str, near: tuple) -> None:
-    """Print the table of one kind of episodes."""
+    """Print the table of one kind of episode."""
     steps = batches(folder, near)
     n_ended = sum(int((step.terminated | step.truncated).sum()) for step in steps)
     space = EnvFactory(observation=SliceChannelsObservation(shape=(84, 84)), **RULES).make_env(read_dataset(folder))
     to_plain = Replay(N_PLAIN, N_ENVS)
     image = replay_for(space.observation_space, N_TRANSITIONS, N_ENVS)
-    # What the first call compiles is no growth of the buffer.
+    # Compiles: that memory is not the buffer's.
     replay_for(space.observation_space, N_ENVS, N_ENVS).add(steps[0])
     endless, n_steps = cycle(steps), N_PLAIN // N_ENVS
     plain_s, plain_bytes = filled(to_plain, islice(cycle(steps), n_steps))
@@ -153,7 +154,7 @@ def measure(folder: str | Path, name: str, near: tuple) -> None:
 
 
 def main() -> None:
-    """Print a table for each kind of episodes, each measured in a process of its own."""
+    """Print a table for each kind of episode, each measured in its own process."""
     folder = sys.argv[1] if len(sys.argv) > 1 else DEFAULT_FOLDER
     context = multiprocessing.get_context("spawn")
     for name, near in (("short episodes", NEAR_SHORT), ("long episodes", NEAR_LONG)):

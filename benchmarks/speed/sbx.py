@@ -1,11 +1,11 @@
-"""Processor time of a whole training with SBX's SAC, which is compiled by JAX, on the default environment.
+"""Measure the processor time of a training with SBX's SAC, which is compiled by JAX, in the default environment.
 
     python -m benchmarks.speed.sbx [--threads N]
 
-SBX is not among armscan's dependencies: `pip install . sbx-rl` into an environment of its own. Environments, networks
-(64-64), batches of 256, replay, random steps first and updates (4 after each 16 steps) are those of the default run,
-20,000 steps; nothing is validated. `benchmarks.speed.training` measures ours, validations included. The first training
-of the process compiles, those after it are measured.
+SBX is not among armscan's dependencies: `pip install . sbx-rl` into its own virtual environment. Environments, networks
+(64-64), batches of 256, replay buffer, random steps at the start and updates (4 after each 16 steps) are as in the
+default run, with 20,000 steps; nothing is validated. `benchmarks.speed.training` measures ours, validations included.
+The first training of the process compiles, those after it are measured.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ N_TRAININGS = 2
 
 
 def environments() -> Any:
-    """Return the environments as Stable-Baselines3 takes them, reset one by one where an episode has ended."""
+    """Return the environments as a `VecEnv` of Stable-Baselines3, which resets those whose episode has ended."""
     from gymnasium.vector import AutoresetMode
     from stable_baselines3.common.vec_env import VecEnv
 
@@ -33,7 +33,7 @@ def environments() -> Any:
     class SideBySide(VecEnv):
         def __init__(self) -> None:
             self.envs = ArmscanVectorEnv(N_ENVS, load_phantoms(range(16)), autoreset_mode=AutoresetMode.DISABLED)
-            # As a training of ours needs them.
+            # As in our trainings.
             self.envs.info_keys = ("action", "reward", "is_success")
             super().__init__(N_ENVS, self.envs.single_observation_space, self.envs.single_action_space)
 

@@ -1,10 +1,10 @@
-"""Memory of several workers that train on the same phantoms, and how soon they have them.
+"""Measure the memory of several workers that train on the same phantoms, and the time to load these.
 
     python -m benchmarks.speed.shared_memory [WORKERS] [PHANTOMS]
 
-Default: 8 workers, 128 phantoms. Each builds a default SAC learner, its environments and all that a training imports,
-takes some steps and gradient steps, and reads every voxel. What counts is the proportional set size of all together
-(PSS: a page that several processes map counts for each by its share), which no page counts twice in.
+Default: 8 workers, 128 phantoms. Each imports what a training imports, builds a default SAC learner and its
+environments, takes some steps and gradient steps, and reads every voxel. Measured is the sum of their proportional set
+sizes (PSS: a page that several processes map counts for each by its share), which counts no page twice.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ from typing import Any
 from armscan.volumes import load_phantoms
 
 N_STEPS = 400
+# Of the slowest worker; if one fails, the others do not wait for ever.
+WAIT_S = 1800.0
 
 
 def pss_bytes() -> int:
@@ -30,7 +32,7 @@ def pss_bytes() -> int:
 
 
 def work(n_phantoms: int, together: Barrier, answers: Any) -> None:
-    """Train for a moment; report bytes and the seconds until the phantoms were there."""
+    """Train for a moment; report PSS in bytes, and wall and processor seconds to load the phantoms."""
     # Imported for the memory that it takes in each worker.
     import mlflow  # noqa: F401
 
@@ -64,11 +66,11 @@ def main(words: list[str]) -> None:
     n_workers, n_phantoms = (int(word) for word in (*words, *("8", "128")[len(words) :]))
     n_voxels = sum(volume.labels.size for volume in load_phantoms(range(n_phantoms)).values())
     context = multiprocessing.get_context("spawn")
-    together, answers = context.Barrier(n_workers), context.Queue()
+    together, answers = context.Barrier(n_workers, timeout=WAIT_S), context.Queue()
     workers = [context.Process(target=work, args=(n_phantoms, together, answers)) for _ in range(n_workers)]
     for worker in workers:
         worker.start()
-    reports = [answers.get() for _ in workers]
+    reports = [answers.get(timeout=WAIT_S) for _ in workers]
     for worker in workers:
         worker.join()
     n_bytes = sum(pss for pss, _, _ in reports)

@@ -1,10 +1,10 @@
-"""Processor time of commands until they answer, and of a run until it trains, in fresh processes.
+"""Measure the processor time of commands until they answer, and of a run until it trains, in fresh processes.
 
     python -m benchmarks.speed.start [--before CHECKOUT]
 
 Each figure is the least of several processes, after one that has compiled everything, made the phantoms and the store.
-With `--before`, each process of this checkout is followed by one of the other, whose figure stands beside it. A command
-that goes on after the line that is waited for is killed there.
+With `--before`, each process of this checkout follows one of the other, whose figure stands beside it. A command that
+continues after the awaited line is killed there.
 """
 
 from __future__ import annotations

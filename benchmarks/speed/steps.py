@@ -1,10 +1,10 @@
-"""Processor time of environment steps beside an earlier checkout, in turn in one run.
+"""Measure the processor time of environment steps, compared with an earlier checkout, in one run.
 
-    python -m benchmarks.speed.steps --before CHECKOUT [--rounds N] [--threads N]
+    python -m benchmarks.speed.steps --before CHECKOUT [--rounds N]
 
-The default environment, on the four default phantoms, and its vector form, with random actions, resets included; one
-thread. Both checkouts have a process each, which take turns of 2,000 steps of each case; figures are medians over the
-rounds, those of the processor time of the process.
+The default environment on the four default phantoms, and its vector form, with random actions, resets included, on one
+thread. Each checkout has its own process; the two take turns of 2,000 steps of each case. Figures are medians of the
+processor time over the rounds.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ CASES: dict[str, tuple[int, dict[str, Any]]] = {
 
 
 def main() -> None:
-    """Print the table, or take steps for another process that does."""
+    """Print the table, or take steps for the process that prints it."""
     if sys.argv[1:] == ["--serve"]:
         serve()
         return
@@ -72,8 +72,8 @@ def serve() -> None:
 
 
 def measured(num_envs: int, rules: dict[str, Any]) -> Callable[[], None]:
-    """Return what takes the steps."""
-    # Of the checkout that this process was started for.
+    """Return a function that takes the steps."""
+    # From the checkout that this process was started for.
     import gymnasium as gym
 
     import armscan

@@ -2,11 +2,11 @@
 
     python -m benchmarks.speed.tracking [--rounds 3] [--env-steps 20000] [--every 1000]
 
-The default run, never stopped early, trains with the same seed, and so takes the same steps, tracked nowhere, in
-SQLite, on an MLflow server, and on one that goes away after the run has begun; in turn, in one process. Tracking has
-its share of the time in two ways: training waits for calls of its own (`calls`), and threads beside it (delivery,
-system metrics) compute while it cannot, at worst for all of the time that they compute (`threads`). Their sum over the
-training's wall time is what tracking costs at most. The longest call is what training has waited at once.
+The default run, never stopped early, trains with the same seed, and so takes the same steps: untracked, in SQLite, on
+an MLflow server, and on one that stops after the run has begun; in turn, in one process. Tracking takes time in two
+ways: training waits for its own calls (`calls`), and background threads (delivery, system metrics) compute while it
+cannot, at worst for all of their processor time (`threads`). Their sum over the training's wall time is an upper bound
+of the cost. The longest call is the longest single wait.
 """
 
 from __future__ import annotations
@@ -58,12 +58,12 @@ class Cost(NamedTuple):
 
     @property
     def share(self) -> float:
-        """Share of the training's time, at most."""
+        """Upper bound of tracking's share of the training's time."""
         return (self.calls_s + self.threads_s) / self.wall_s
 
 
 class Timed:
-    """A training callback that knows how long another one takes."""
+    """A training callback that times another one."""
 
     def __init__(self, callback: TrackedRun) -> None:
         self._callback, self.calls_s = callback, []
@@ -87,28 +87,28 @@ class Timed:
 
 
 class ThreadClock(threading.Thread):
-    """Looks at how long tracking's threads have computed; one that has ended cannot be asked any more."""
+    """Polls the processor time of tracking's threads, which can't be read once a thread has ended."""
 
     def __init__(self) -> None:
         super().__init__(daemon=True)
         self._over, self._seen = threading.Event(), {}
 
     def run(self) -> None:
-        """Look again and again."""
+        """Poll until `computed_s` is called."""
         process = psutil.Process()
         while not self._over.wait(LOOK_S):
             ours = {each.native_id for each in threading.enumerate() if each.name in THREADS}
             self._seen |= {each.id: each.user_time + each.system_time for each in process.threads() if each.id in ours}
 
     def computed_s(self) -> float:
-        """End it; return what they have computed."""
+        """Stop polling; return the processor seconds of all threads seen."""
         self._over.set()
         self.join()
         return sum(self._seen.values())
 
 
 def trained(config: Any, tracking: dict[str, Any] | None, before: Callable[[], None] = lambda: None) -> Cost:
-    """Return what one training took; `before` is called when the run has begun."""
+    """Train once and return the times; `before` is called when the run has begun."""
     setup = set_up(config)
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         callbacks, clock = [], ThreadClock()
@@ -130,7 +130,7 @@ def trained(config: Any, tracking: dict[str, Any] | None, before: Callable[[], N
 
 @contextmanager
 def ways(folder: Path) -> Iterator[dict[str, Callable[[Any], Cost]]]:
-    """Yield the ways of tracking that are compared, by what they are called."""
+    """Yield the ways of tracking that are compared, by name."""
 
     def section(uri: str) -> dict[str, Any]:
         return {

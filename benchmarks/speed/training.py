@@ -1,9 +1,9 @@
-"""Time of whole trainings, and of whole runs, beside those of an earlier checkout.
+"""Measure the time of trainings and of whole runs, compared with an earlier checkout.
 
     python -m benchmarks.speed.training [--before CHECKOUT] [--rounds N] [CASE ...]
 
-Each training is a run in a fresh process, tracked in SQLite, one thread for BLAS and torch; those of both checkouts
-take turns, after one short run of each that compiles everything and makes the phantoms. Figures are medians over the
+Each training is a run in a fresh process, tracked in SQLite, one thread for BLAS and torch. Both checkouts take turns,
+after one short run of each that compiles everything and makes the phantoms. Figures are medians over the
 rounds. Cases: `default` (20,000 steps, never stopped early), `make_run` (the default run), `best_full`
 (`experiment=best_full`); default: the first two.
 """

@@ -1,9 +1,10 @@
-"""Processor time of the trials of `sac_y` in a warm worker, from claim to tell, beside an earlier checkout.
+"""Measure the processor time of the trials of `sac_y` in a warm worker, compared with an earlier checkout.
 
     python -m benchmarks.speed.trials [--before CHECKOUT] [--trials N]
 
-One worker in a process of its own runs N trials (default: 4) without pruning; the first, which imports and compiles, is
-left out. The sampler draws the first trials at random from the study's seed, so that both checkouts have the same ones.
+One worker in its own process runs N trials (default: 4) without pruning. A trial counts after its claim until before
+its tell; the mean leaves out the first, which imports and compiles. The sampler draws the first trials at random from
+the study's seed, so that both checkouts have the same ones.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from pathlib import Path
 
 from benchmarks.speed.checkouts import HERE
 
-# Python imports this at the start of each process, the worker's included, whose module it waits for.
+# Python imports this `sitecustomize` at the start of each process; in the worker's, it times the trials.
 SITE = """
 import importlib.util, os, sys, time
 NAME = "armscan.sweeps.workers.worker"

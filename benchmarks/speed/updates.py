@@ -1,10 +1,10 @@
-"""Measure the updates a second of an agent, by how its networks are computed.
+"""Measure the gradient steps per second of SAC, by device, precision and compilation.
 
     python -m benchmarks.speed.updates [PART-OF-A-NAME ...]
 
-SAC on phantoms, with the network and batch size of its preset; a replay buffer of random steps, then rounds of updates,
-the ways of computing in turn. The figures to quote are the ratios to 32 bits without compilation, each the median over
-the rounds. Takes the devices that there are; on a GPU times are taken after it has finished what was asked of it.
+SAC on phantoms, with batches of 256: a replay buffer of random steps, then rounds of updates, in each way in turn. The
+figures to quote are the ratios to float32 without compilation on the CPU, each the median over the rounds. Uses the
+available devices; on a GPU, time ends when all queued work is done.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ CASES: dict[str, tuple[EnvFactory, Network]] = {
 
 
 def ways() -> dict[str, Compute]:
-    """Return the ways of computing that this machine has, by what they are called."""
+    """Return the ways of computing that this machine has, by name."""
     devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
     return {
         f"{device}, {precision}{', compiled' if is_compiled else ''}": Compute(device, precision, is_compiled)
@@ -53,7 +53,7 @@ def ways() -> dict[str, Compute]:
 
 
 def updater(env_factory: EnvFactory, network: Network, compute: Compute):
-    """Return what measures updates a second, with a replay buffer that is filled."""
+    """Return a function that measures updates per second, with a filled replay buffer."""
     volumes = load_phantoms(range(2))
     setup = AgentSetup(
         make_envs=partial(env_factory.make_vector_env, volumes=volumes, autoreset_mode="Disabled"),

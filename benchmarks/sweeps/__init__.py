@@ -1,1 +1,1 @@
-"""Benchmarks of studies: cost beside the trials, failures, and how studies decide."""
+"""Benchmarks of studies: overhead, failures of workers and storage, and decisions."""

@@ -1,18 +1,19 @@
-"""Measure what a study costs beside its trials, and what is left of it when its workers are killed.
+"""Measure the overhead of a study, and how it survives killed workers.
 
     python -m benchmarks.sweeps compare [folder=FOLDER] [trials=60] [shortest_s=6] [longest_s=30]
-                                        the workers' time spent in trials, beside Hydra's own Optuna sweeper
+                                        share of worker time spent in trials, compared with Hydra's own Optuna sweeper
     python -m benchmarks.sweeps same_budget [folder=FOLDER] [tasks=[sac_y]] [first=0] [replicates=4] [seeds=8]
-                                        what both find with the same processor time, by real trainings
+                                        what both find with the same processor time, in real trainings
     python -m benchmarks.sweeps idle [folder=FOLDER] [trials=60] [shortest_s=1] [longest_s=5]
-                                        the same of armscan alone, with trials that are over soon
+                                        share of worker time spent in trials, armscan alone with short trials
     python -m benchmarks.sweeps beside [folder=FOLDER] [trials=10]
                                         what a study adds to a training of a minute
     python -m benchmarks.sweeps kill [folder=FOLDER] [trials=200] [every_s=20] [storage=journal]
-                                        200 trials, workers killed, the storage (or sqlite, postgresql) away twice
+                                        trials finished although workers are killed, and the storage
+                                        (journal, sqlite or postgresql) is unavailable twice
 
-But for `same_budget` and `beside`, trials only wait (`benchmarks/sweeps/sleeping.py`), so that four workers can be had
-on two cores.
+Except in `same_budget` and `beside`, trials only wait (`benchmarks/sweeps/sleeping.py`), so that two cores are enough
+for four workers.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ MEASURES: dict[str, Callable[..., None]] = {
 
 
 def main(words: list[str]) -> None:
-    """Measure what is asked for."""
+    """Run the benchmark that the words name."""
     given = dict(word.split("=", 1) for word in words if "=" in word)
     what = [word for word in words if "=" not in word]
     if len(what) != 1 or what[0] not in MEASURES:

@@ -1,9 +1,9 @@
-"""The same trials by armscan's studies and by Hydra's own Optuna sweeper, one after the other.
+"""Run the same trials with a study of armscan and with Hydra's own Optuna sweeper, one after the other.
 
-Hydra's sweeper runs in an environment of its own, which is made once, in the cache folder: its versions
-(`hydra_optuna/requirements.txt`) are not those of armscan. It takes a batch of trials, one for each worker, waits for
-all of them, and takes the next. Both keep the study in a file and draw at random, and trial number N takes as long on
-both. A study of armscan does more: each trial is tracked in MLflow, and reports ten times.
+Hydra's sweeper needs other versions than armscan (`hydra_optuna/requirements.txt`) and runs in its own virtual
+environment, created once in the cache folder. It starts trials in batches, one per worker, and waits for a whole batch
+before the next. Both keep the study in a file and sample at random, and trial number N takes equally long with both. A
+study of armscan does more: each trial is tracked in MLflow, and reports ten times.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Sweep:
 
 
 def compare(folder: Path, *, trials: int = 60, shortest_s: float = 6.0, longest_s: float = 30.0) -> None:
-    """Run both, and print what came of them."""
+    """Run both, and print the table."""
     python = hydra_python()
     start_s = time.monotonic()
     state = slept(folder, trials, shortest_s, longest_s)
@@ -69,7 +69,7 @@ def compare(folder: Path, *, trials: int = 60, shortest_s: float = 6.0, longest_
 
 
 def hydra_python() -> Path:
-    """Return the interpreter of the environment of Hydra's sweeper, which is made where there is none."""
+    """Return the Python of the virtual environment of Hydra's sweeper, which is created if missing."""
     requirements = HYDRA_OPTUNA / "requirements.txt"
     version = hashlib.sha256(requirements.read_bytes()).hexdigest()[:12]
     folder = cache_folder() / f"hydra_optuna-{version}"

@@ -24,10 +24,10 @@ N_TRIALS, N_VALIDATION, N_TEST, N_JUDGING = 30, 8, 12, 5
 MIN_SEEDS, MEAN_SEEDS = 2, 6
 MAX_SEEDS = MAX_SEEDS_FACTOR * MEAN_SEEDS
 CONTROL, CONTROL_STEPS = -1, 2.6
-# Of trainings, of volumes, and of the luck of a single look, in steps.
+# Standard deviations in steps: between trainings, between volumes, and of a single trial's value.
 OF_SEEDS, OF_VOLUMES, LUCK = 0.35, 0.4, 0.5
 SEED = 72
-# Behind texts, so that no line runs through them.
+# Background of texts, so that no line runs through them.
 PAPER = {"facecolor": "white", "edgecolor": "none", "pad": 1.5}
 
 

@@ -1,15 +1,15 @@
-"""Simulate how often the interval of a study's result contains the true difference, beside other intervals.
+"""Simulate how often the interval of a study's result contains the true difference, compared with other intervals.
 
     python -m benchmarks.sweeps.judgement [--studies 2000]
 
 A simulated study has four candidates and the control. The score of a training on a volume is the sum of its
-configuration's true value, an effect of the training, one of the configuration on the volume, and a rest, all normal.
-The configuration is selected by `armscan.sweeps.scheduling.race`. Of the studies that do not choose the control, the
-table has the share of those whose 95 % interval of chosen less control contains the true difference:
+configuration's true value, an effect of the training, an effect of the configuration on the volume, and a residual, all
+normal. `armscan.sweeps.scheduling.race` selects the configuration. The table counts the studies that do not choose the
+control: the share whose 95 % interval of chosen minus control contains the true difference.
 
-- `paired`: as armscan judges, with seeds of its own, and `armscan.stats.paired`;
-- `bootstrap`: seeds of its own, and a percentile bootstrap of the seeds;
-- `improvement`: not of the difference, but of the probability that a training is better on a volume.
+- `paired`: as armscan judges, with new seeds and `armscan.stats.paired`;
+- `bootstrap`: new seeds, and a percentile bootstrap over seeds;
+- `improvement`: the interval of the probability of improvement, instead of the difference.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from armscan.sweeps.scheduling.race import MAX_SEEDS_FACTOR, race
 
 N_CANDIDATES, N_VALIDATION, MIN_SEEDS, MEAN_SEEDS = 4, 8, 2, 6
 MAX_SEEDS = MAX_SEEDS_FACTOR * MEAN_SEEDS
-# Standard deviations of the effects of trainings, of volumes for each configuration, and of the rest.
+# Standard deviations of the effects of trainings, of the effects of configurations on volumes, and of the residuals.
 OF_SEEDS, OF_VOLUMES, REST = 1.0, 0.4, 0.5
-# Of the difference of two trainings on a volume.
+# Standard deviation of the difference between two trainings on a volume.
 OF_DIFFERENCE = (2 * (OF_SEEDS**2 + OF_VOLUMES**2 + REST**2)) ** 0.5
 N_SEEDS, N_VOLUMES, EFFECTS = (2, 3, 5, 10), (4, 8, 12), (0.0, 1.0)
 
 
 class Coverage(NamedTuple):
-    """Shares of the studies whose interval contains the truth, by the way of judging; see above."""
+    """Shares of the studies whose interval contains the truth, for each interval of the module's docstring."""
 
     paired: float
     bootstrap: float

@@ -1,4 +1,4 @@
-"""Run a study whose workers are killed and whose storage is away twice; count what is left."""
+"""Run a study while its workers are killed and its storage is unavailable twice; count its trials."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
@@ -25,7 +25,7 @@ AWAY_S = 10.0
 
 
 def kill(folder: Path, *, trials: int = 200, every_s: float = 20.0, storage: str = "journal") -> None:
-    """Kill workers, and take the storage away twice, until the study is done; count what has become of it."""
+    """Kill workers, and make the storage unavailable twice, until the study is done; count its trials."""
     with storage_of_kind(storage, folder) as (uri, take_away):
         process = started(folder, *SLEEPING, f"study.n_trials={trials}", f"study.storage={uri}")
         chance, n_killed, n_away, start_s = random.Random(0), 0, 0, time.monotonic()
@@ -35,7 +35,9 @@ def kill(folder: Path, *, trials: int = 200, every_s: float = 20.0, storage: str
             if time.monotonic() < next_s + every_s or not (workers := workers_in(folder)):
                 continue
             next_s = time.monotonic()
-            os.kill(chance.choice(workers), signal.SIGKILL)
+            # It may have ended by itself since.
+            with suppress(ProcessLookupError):
+                os.kill(chance.choice(workers), signal.SIGKILL)
             n_killed += 1
             if n_killed in (3, 6):
                 take_away()
@@ -51,13 +53,13 @@ def kill(folder: Path, *, trials: int = 200, every_s: float = 20.0, storage: str
 
 
 def workers_in(folder: Path) -> list[int]:
-    """Return the processes of the workers that are at work."""
+    """Return the process IDs of the running workers."""
     return [each.pid for start in folder.glob(f"studies/{NAME}/workers/*") for each in local_workers(start)]
 
 
 @contextmanager
 def storage_of_kind(kind: str, folder: Path) -> Iterator[tuple[str, Callable[[], None]]]:
-    """Yield a storage, and the function that takes it away from the workers for a while."""
+    """Yield a storage's URI, and a function that makes it unavailable to the workers for `AWAY_S`."""
     match kind:
         case "journal":
             yield JOURNAL, partial(hold_lock, folder / f".{JOURNAL}.lock")
@@ -71,13 +73,13 @@ def storage_of_kind(kind: str, folder: Path) -> Iterator[tuple[str, Callable[[],
 
 
 def hold_lock(file: Path) -> None:
-    """Hold the lock of a journal."""
+    """Hold the lock of a journal for `AWAY_S`."""
     with FileLock(file):
         time.sleep(AWAY_S)
 
 
 def lock_file(file: Path) -> None:
-    """Lock a file of SQLite."""
+    """Lock a SQLite file for `AWAY_S`."""
     with closing(sqlite3.connect(file, isolation_level=None, timeout=60.0)) as connection:
         connection.execute("BEGIN EXCLUSIVE")
         time.sleep(AWAY_S)

@@ -1,7 +1,7 @@
 """Measure the share of a sweep's worker time that is spent in its trials.
 
-The trials only wait, and what of the workers' time they do not wait is the sweeper's: choosing what to try, starting a
-trial, writing down what came of it, and above all workers with nothing to do although there are trials left.
+The trials only wait; all other time of the workers is the sweeper's: it samples parameters, starts trials, stores
+results, and above all leaves workers idle although trials are left.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from benchmarks.sweeps.wait import Waited
 
 @dataclass(frozen=True)
 class Occupation:
-    """Time of a sweep's workers, from the begin of the first trial to the end of the last.
+    """Time of a sweep's workers, from the start of the first trial to the end of the last.
 
     Args:
         of_worker: Waits of each worker.
@@ -31,7 +31,7 @@ class Occupation:
 
     @classmethod
     def of_study(cls, state: StudyState) -> Self:
-        """Return that of a study of `benchmarks.sweeps.sleeping`."""
+        """Return the occupation of the workers of a `benchmarks.sweeps.sleeping` study."""
         return cls({worker: list(map(_waited, trials)) for worker, trials in by_worker(state).items()})
 
     @property
@@ -46,29 +46,29 @@ class Occupation:
 
     @property
     def ends_s(self) -> list[float]:
-        """Time at which the last trial of each worker had waited."""
+        """Time at which the last trial of each worker ended."""
         return [max(each.end_s for each in one) for one in self.of_worker.values()]
 
     @property
     def wall_s(self) -> float:
-        """From the first trial's begin to the last one's end."""
+        """Seconds from the start of the first trial to the end of the last."""
         return max(self.ends_s) - self.begin_s
 
     @property
     def share_of_wall(self) -> float:
-        """Share of the time of all workers in which trials waited; idle workers at the end count."""
+        """Share of the time of all workers in which trials waited, with the idle time at the end."""
         return self.waited_s / (N_WORKERS * self.wall_s)
 
     @property
     def share_until_last(self) -> float:
-        """The same, but each worker counts only until the end of its own last trial: then nothing was left to do."""
+        """The same, but each worker counts only until its own last trial ends: no trial was left after that."""
         return self.waited_s / sum(end_s - self.begin_s for end_s in self.ends_s)
 
 
 def share_in_trials(state: StudyState) -> float:
-    """Return what share of the workers' time a study's trials are at hand, by the storage: from claim to tell.
+    """Return the share of the workers' time that lies between a trial's claim and its tell, by the storage.
 
-    Each worker counts from the first trial's begin to the end of its own last one.
+    Each worker counts from the start of the study's first trial to the end of its own last one.
     """
     workers = by_worker(state).values()
     begin = min(trials[0].datetime_start for trials in workers)
@@ -77,13 +77,13 @@ def share_in_trials(state: StudyState) -> float:
 
 
 def slept(folder: Path, trials: int, shortest_s: float, longest_s: float) -> StudyState:
-    """Run a study of `benchmarks.sweeps.sleeping` in a folder, and return how it stands then."""
+    """Run a study of `benchmarks.sweeps.sleeping` in a folder, and return its state."""
     lengths = (f"+study.task.shortest_s={shortest_s}", f"+study.task.longest_s={longest_s}")
     return finish(folder, *SLEEPING, *lengths, f"study.n_trials={trials}")
 
 
 def idle(folder: Path, *, trials: int = 60, shortest_s: float = 1.0, longest_s: float = 5.0) -> None:
-    """Measure how much of the workers' time is spent in trials, and what each trial takes beside what it does."""
+    """Measure the share of the workers' time spent in trials, and the overhead of each trial."""
     state = slept(folder, trials, shortest_s, longest_s)
     occupation = Occupation.of_study(state)
     beside_s = sorted(

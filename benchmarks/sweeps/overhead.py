@@ -1,16 +1,15 @@
 """Measure the time that a study adds to a trial beside its training.
 
-A trial is at hand from its claim to its tell, by the storage. Its worker then still closes the trial's tracked run and
-claims the next one. All of that is the study's, but for what a single run of `armscan.run` does as well, which is what
-the task does between its begin and its end: environments and agent are built, the training is tracked, checkpoints are
-written, the learning curve is drawn. Within that the study's are the calls to the attempt (`OF_STUDY`): the composing
-of the configuration, which a single run does only once; the reports, with the pruner's answer; what is noted when a
-seed is done; the picture for the dashboard.
+A trial counts from its claim to its tell, by the storage. That includes closing the tracked run of the worker's trial
+before, because a worker tells one trial and claims the next at once. All of this time is the study's, except what a
+single run of `armscan.run` does as well. That is the task: it builds environments and agent, tracks the training,
+writes checkpoints and draws the learning curve. Within the task, the calls to the attempt (`OF_STUDY`) are the study's:
+setting the seed in the configuration, the reports with the pruner's answer, the metrics of each finished seed, and the
+picture for the dashboard.
 """
 
 from __future__ import annotations
 
-import itertools
 import statistics
 import time
 from collections.abc import Callable
@@ -43,10 +42,10 @@ TRAINING = (
 
 
 class TimedTraining(TrainingTask):
-    """The task of training an agent, which says what of its time was the study's."""
+    """The training task, which measures how much of its time is the study's."""
 
     def metrics(self, config: DictConfig) -> tuple[str, ...]:
-        """Return those of a training, and the seconds of the whole task and of the study's part in it."""
+        """Return the metrics of a training, the seconds of the whole task, and those of each call of `OF_STUDY`."""
         return (*super().metrics(config), "task_s", *(f"{name}_s" for name in OF_STUDY))
 
     def run(self, attempt: Attempt) -> dict[str, float]:
@@ -74,7 +73,7 @@ def _timed(method: Callable[..., Any], name: str, spent_s: dict[str, float]) -> 
 
 @dataclass(frozen=True)
 class Shares:
-    """Seconds of a trial from its claim to its tell, in four parts that add up to all of them.
+    """Seconds of a trial from its claim to its tell, in four parts that add up to the whole.
 
     Args:
         training_s: Seconds of learning, validating, tracking and writing checkpoints.
@@ -90,43 +89,36 @@ class Shares:
 
     @classmethod
     def of(cls, trial: FrozenTrial) -> Self:
-        """Return those of a finished trial."""
+        """Return the shares of a finished trial."""
         figures = trial.user_attrs[METRICS]
         within_s = sum(figures[f"{name}_s"] for name in OF_STUDY)
         # The reports are made while the agent is trained.
         training_s = figures["training_s"] - figures["report_s"]
-        at_hand_s = (trial.datetime_complete - trial.datetime_start).total_seconds()
+        trial_s = (trial.datetime_complete - trial.datetime_start).total_seconds()
         task_s = figures["task_s"]
-        return cls(training_s, task_s - training_s - within_s, at_hand_s - task_s, within_s)
+        return cls(training_s, task_s - training_s - within_s, trial_s - task_s, within_s)
 
     @property
-    def at_hand_s(self) -> float:
-        """From claim to tell."""
+    def trial_s(self) -> float:
+        """Seconds from claim to tell."""
         return self.training_s + self.single_s + self.around_s + self.within_s
 
 
 def beside(folder: Path, *, trials: int = 10) -> None:
-    """Train, and print what the study took of each trial."""
+    """Train, and print the time that the study adds to each trial."""
     workers = by_worker(finish(folder, *TRAINING, f"study.n_trials={trials}")).values()
     shares = [Shares.of(trial) for of_worker in workers for trial in of_worker]
-    between_s = [
-        (after.datetime_start - before.datetime_complete).total_seconds()
-        for of_worker in workers
-        for before, after in itertools.pairwise(of_worker)
-    ]
-    # A worker's last trial is followed by none: the median stands for what would have been.
-    gap_s = statistics.median(between_s)
-    study_s = [each.around_s + each.within_s + gap_s for each in shares]
+    # The tell of a trial and the claim of the next are one transaction, whose time counts for neither.
+    study_s = [each.around_s + each.within_s for each in shares]
     rows = {
-        "a trial, from claim to tell": [each.at_hand_s for each in shares],
+        "a trial, from claim to tell": [each.trial_s for each in shares],
         "its training: learning, validating, tracking, checkpoints": [each.training_s for each in shares],
         "the rest of a single run: building, its tracked run, the curve": [each.single_s for each in shares],
         "the study, before and after the task": [each.around_s for each in shares],
         "the study, within the task": [each.within_s for each in shares],
-        "the study, between a tell and the worker's next claim": between_s,
         "the study, in all": study_s,
         "the same, in % of the trial": [
-            100 * own_s / each.at_hand_s for own_s, each in zip(study_s, shares, strict=True)
+            100 * own_s / each.trial_s for own_s, each in zip(study_s, shares, strict=True)
         ],
     }
     print(f"{len(shares)} trials by {len(workers)} workers\n\n| s | median | most |\n| --- | --- | --- |")

@@ -1,12 +1,12 @@
-"""Pruning with two objectives: the hypervolume kept and the environment steps taken.
+"""Measure pruning with two objectives: the hypervolume kept and the environment steps taken.
 
     python -m benchmarks.sweeps.pareto [folder=FOLDER] [trials=60] [replays=200]
 
-Two studies without pruning, at points drawn at random, are replayed with `study/pruner=pareto`, in other orders each
-time. A trial of the replay is the same training as far as it goes, so that what differs is the pruning.
+Two studies with random sampling and no pruning are replayed with `study/pruner=pareto`, each time in another random
+order. A replayed trial is the same training until it is pruned, so that only the pruning differs.
 
-- `speed_vs_success` along the arm: success rate and environment steps until it is solved. A folder that has the study
-  already is resumed.
+- `speed_vs_success` along the arm: success rate and environment steps until it is solved. If the folder already has the
+  study, it is resumed.
 - `sac_y`: mean steps and processor seconds, of the trainings in the table of the bench (`benchmarks/sweeps/bench`).
 """
 
@@ -54,7 +54,7 @@ class Unpruned:
     trials: Sequence[FrozenTrial]
 
     def losses(self, trials: Sequence[FrozenTrial]) -> np.ndarray:
-        """Return the values of trials, lower ones better, from 0 for the best to 1 for the worst of all trials."""
+        """Return the objectives of trials as losses, from 0 for the best to 1 for the worst of all trials."""
         signs = loss_signs(self.directions)
         of_all, values = (np.array([trial.values for trial in each]) * signs for each in (self.trials, trials))
         best, worst = of_all.min(axis=0), of_all.max(axis=0)
@@ -114,7 +114,7 @@ def _replayed(study: optuna.Study, trial: FrozenTrial) -> int | None:
 
 
 def compare(unpruned: Unpruned, n_replays: int) -> None:
-    """Print what pruning keeps and saves, over replays in other orders."""
+    """Print what pruning keeps and saves, over replays in random orders."""
     trials, rng = unpruned.trials, np.random.default_rng(0)
     hypervolume, env_steps, _ = replay(unpruned, trials, NopPruner())
     orders = [rng.permutation(len(trials)) for _ in range(n_replays)]
@@ -131,7 +131,7 @@ def compare(unpruned: Unpruned, n_replays: int) -> None:
 
 
 def main(words: list[str]) -> None:
-    """Measure what is asked for."""
+    """Measure both studies."""
     given = dict(word.split("=", 1) for word in words)
     folder = Path(given.get("folder") or tempfile.mkdtemp()).absolute()
     optuna.logging.set_verbosity(optuna.logging.ERROR)

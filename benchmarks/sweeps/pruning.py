@@ -2,8 +2,8 @@
 
     python -m benchmarks.sweeps.pruning [folder=FOLDER] [seeds=0,1,2] [trials=40]
 
-Both studies of a seed draw the same points at random, so that a trial of one is the same training as that of the other
-as far as it goes, and what differs is the pruning. A folder that has studies already is gone on with.
+Both studies of a seed sample the same random points, so that a trial is the same training in both until it is pruned,
+and only the pruning differs. Studies already in the folder are resumed.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def trials_of(folder: Path, seed: int, name: str, n_trials: int) -> list[FrozenT
 
 
 def env_steps_until(trials: list[FrozenTrial], value: float) -> int | None:
-    """Return the environment steps of the trials that had ended when one was as good as this; None where none was."""
+    """Return the environment steps of all trials up to the first that reached a value; None if none did."""
     n_env_steps = 0
     for trial in trials:
         n_env_steps += env_steps_of(trial)
@@ -38,7 +38,7 @@ def env_steps_until(trials: list[FrozenTrial], value: float) -> int | None:
 
 
 def compare(folder: Path, seed: int, n_trials: int) -> None:
-    """Print how both studies of a seed went."""
+    """Print the results of both studies of a seed."""
     plain, pruned = (trials_of(folder, seed, name, n_trials) for name in STUDIES)
     best = {
         name: min(trial.values[0] for trial in each if trial.state == TrialState.COMPLETE)
@@ -58,7 +58,7 @@ def compare(folder: Path, seed: int, n_trials: int) -> None:
 
 
 def main(words: list[str]) -> None:
-    """Run what is asked for."""
+    """Compare the studies of each seed."""
     given = dict(word.split("=", 1) for word in words)
     folder = Path(given.get("folder") or tempfile.mkdtemp())
     for seed in map(int, given.get("seeds", "0,1,2").split(",")):

@@ -2,17 +2,17 @@
 
     python -m benchmarks.sweeps same_budget [folder=FOLDER] [tasks=[sac_y,sac_zy]] [first=0] [replicates=4] [seeds=8]
 
-In each replicate both search once. The replicate's number is the seed of both samplers, and trainings have seeds of
-their own. Both sides have the same space, presets, training seeds and objective, and train one trial at a time
+In each replicate, both search once. The replicate's number is the seed of both samplers, and determines the seeds of
+its trainings. Both sides have the same space, presets, training seeds and objective, and train one trial at a time
 (`benchmarks.sweeps.searches`):
 
-- armscan: a study with its default sampler, pruner and choice. The search has half of the budget, the race the rest:
-  in a study with the default settings, a search of 40 trials with a pruner and the race take as long as each other. The
-  longest race whose rounds are complete decides.
+- armscan: a study with its default sampler, pruner and selection. The search gets half of the budget, the race the
+  rest: with the default settings, a pruned search of 40 trials and the race take equally long. The longest race with
+  complete rounds decides.
 - Hydra's Optuna sweeper: its default sampler. The trial with the best value is the result.
 
-While budget is left, another trial begins; it always runs to its end. Both results and the default configuration are
-then trained with new seeds, and judged by the objective on the test volumes. Each outcome is a line of `results.jsonl`:
+A trial starts while budget is left, and always runs to its end. Both results and the default configuration are then
+trained with new seeds, and judged by the objective on the test volumes. Each outcome is a line of `results.jsonl`:
 the same command continues after an interruption, and repeats only the search that was cut off. Several processes may
 share the folder if their replicates or tasks differ. `replicates=0` prints the table of all results so far.
 """
@@ -56,7 +56,7 @@ TASKS = {
 ARMSCAN, HYDRA, DEFAULT = "armscan", "hydra", "default"
 Search = Callable[[Sequence[str], float, Path], SearchResult]
 SEARCHES: dict[str, Search] = {ARMSCAN: search_by_armscan, HYDRA: search_by_hydra}
-# The first seed of the judgement; those of searches begin at 0, those of races 1000 above.
+# First seed of the judgement; seeds of searches begin at 0, seeds of races 1000 above.
 FIRST_SEED, SEEDS_APART = 5000, 10
 OBJECTIVE = "mean_steps"
 SHORT = ("training.env_steps=3000", "training.eval_every_env_steps=1000")
@@ -85,7 +85,7 @@ class Results:
 def same_budget(
     folder: Path, *, tasks: Sequence[str] = tuple(TASKS), first: int = 0, replicates: int = 4, seeds: int = 8
 ) -> None:
-    """Make the searches and trainings that are missing, and print the table after each replicate.
+    """Run the missing searches and trainings, and print the table after each replicate.
 
     Args:
         folder: Folder of the results.
@@ -147,7 +147,7 @@ def scores_of(rows: Sequence[Row], task: str) -> tuple[list[int], dict[str, Floa
     """Return the replicates, and mean scores over seeds of the default configuration and of each side.
 
     Args:
-        rows: Rows of the results. Only seeds with all scores count, and replicates with such a seed.
+        rows: Rows of the results. Only seeds that have scores of all sides count, and replicates with such a seed.
         task: Name of the task.
 
     Returns:

@@ -2,9 +2,9 @@
 
     python -m benchmarks.sweeps.scaling [--tracking] [--workers 1 2 4]
 
-Workers take trials that do nothing but report ten times, one after another. They are threads of a few processes, and no
-configuration is composed, because that is not what the services are asked for; all else is what a study does. Without
-`--tracking` runs are tracked nowhere, and what is measured is the storage alone.
+Workers run trials that only report ten times, one after another. They are threads in a few processes and compose no
+configuration, since that needs neither service; all else is as in a study. Without `--tracking`, runs are not tracked,
+and only the storage is measured.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ MAX_PROCESSES, TRIALS_A_WORKER, MIN_TRIALS = 4, 10, 120
 SPACE = {"agent.lr": {"low": 1e-4, "high": 1e-2, "log": True}, "agent.batch_size": {"choices": [64, 128, 256]}}
 SAMPLER = {"_target_": "optuna.samplers.RandomSampler"}
 SETTINGS = {"shared_preload_libraries": "pg_stat_statements", "max_connections": "400"}
-# What a database was asked, and how long it worked at that; who waits for the lock of a study does not keep it busy.
+# Statements and commits of each database, and its busy seconds, which exclude waiting for the lock of a study.
 CALLS = """
 SELECT datname, sum(calls), sum(calls) FILTER (WHERE query ILIKE 'commit%'),
     sum(total_exec_time) FILTER (WHERE query NOT ILIKE '%advisory%') / 1000
@@ -68,7 +68,7 @@ class Asked(NamedTuple):
 
 
 class NoStore:
-    """A tracking store that takes everything and keeps nothing."""
+    """A tracking store that accepts everything and keeps nothing."""
 
     uri, wait_s, system_metrics_s = "nowhere", 5.0, None
 
@@ -76,7 +76,7 @@ class NoStore:
         self.mlflow = self
 
     def create_run(self, *_: Any, **__: Any) -> Any:
-        """Return a run that is nowhere."""
+        """Return a run that is not stored."""
         return SimpleNamespace(info=SimpleNamespace(run_id=uuid.uuid4().hex))
 
     def __getattr__(self, name: str) -> Any:
@@ -97,12 +97,12 @@ def reporting(attempt: Attempt) -> dict[str, float]:
 
 
 def compose_run(words: object) -> tuple[DictConfig, dict[str, str]]:
-    """Return a configuration without composing one."""
+    """Return a fixed configuration instead of composing one."""
     return OmegaConf.create({"seed": 0}), {}
 
 
 def phase_of(storage_uri: str, tracking_uri: str | None, folder: Path, n_trials: int) -> Phase:
-    """Open a study of trials that report, as a worker does."""
+    """Open the study as a worker does; its trials only report."""
     storage = open_storage(storage_uri)
     study = optuna.create_study(study_name="scaling", storage=storage.optuna, load_if_exists=True)
     store: Any = NoStore()
@@ -129,7 +129,7 @@ def phase_of(storage_uri: str, tracking_uri: str | None, folder: Path, n_trials:
 
 @contextmanager
 def round_trips_counted() -> Iterator[dict[int, int]]:
-    """Count how often each thread goes to a storage, by its id."""
+    """Count the storage calls of each thread, by its ID."""
     counts: dict[int, int] = {}
     call = RetryPolicy.call
 
@@ -143,7 +143,7 @@ def round_trips_counted() -> Iterator[dict[int, int]]:
 
 
 def work(phase: Phase, name: str) -> None:
-    """Work at a study as a worker's process does."""
+    """Run a worker as its process does."""
     heartbeat = Heartbeat(
         phase.scheduler, name, is_told_to_leave=lambda: False, leave=lambda: None, on_death=lambda _: None
     )
@@ -152,7 +152,7 @@ def work(phase: Phase, name: str) -> None:
 
 
 def work_in_threads(n_threads: int, number: int, barrier: Any, opened: partial[Phase]) -> None:
-    """Run some of the workers in this process, once those of all processes are there."""
+    """Run some of the workers in this process, once the workers of all processes are ready."""
     worker_module.compose_run = compose_run
     worker_module.log = lambda text: None
     phases = [opened() for _ in range(n_threads)]
@@ -165,14 +165,14 @@ def work_in_threads(n_threads: int, number: int, barrier: Any, opened: partial[P
 
 
 def asked(server: PostgresServer, uri: str) -> Asked:
-    """Return what a database was asked since its counts were reset."""
+    """Return the statements and transactions of a database since its counts were reset."""
     of_database = {name: rest for name, *rest in server.execute(CALLS)}
     statements, commits, busy_s = of_database.get(uri.rpartition("/")[2], (0, 0, 0.0))
     return Asked(int(statements), int(commits or 0), float(busy_s))
 
 
 def measured(server: PostgresServer, n_workers: int, tracking_uri: str | None, folder: Path) -> tuple[float, int, str]:
-    """Run a study; return its seconds, its trials, and the address of its database."""
+    """Run a study; return its seconds, its number of trials, and the URI of its database."""
     n_trials = max(MIN_TRIALS, TRIALS_A_WORKER * n_workers)
     uri = server.make_database()
     opened = partial(phase_of, uri, tracking_uri, folder, n_trials)
@@ -188,14 +188,14 @@ def measured(server: PostgresServer, n_workers: int, tracking_uri: str | None, f
     server.execute("SELECT pg_stat_statements_reset()")
     for process in processes:
         process.join()
-    # From the first trial's beginning to the last one's end: not what processes take to end.
+    # From the start of the first trial to the end of the last, without the time in which processes exit.
     trials = opened().scheduler.study.get_trials(deepcopy=False)
     took = max(each.datetime_complete for each in trials) - min(each.datetime_start for each in trials)
     return took.total_seconds(), n_trials, uri
 
 
 def row(took_s: float, n_trials: int, of_storage: Asked, of_mlflow: Asked | None) -> str:
-    """Return the figures of a study."""
+    """Return the cells of a study in the table."""
     figures = [f"{60 * n_trials / took_s:.0f}", f"{of_storage.commits / n_trials:.1f}"]
     for each in (of_storage, of_mlflow):
         figures += [f"{each.statements / n_trials:.0f}", f"{each.busy_s / took_s:.1%}"] if each else ["-", "-"]

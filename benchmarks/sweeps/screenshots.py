@@ -1,9 +1,9 @@
-"""Pictures of a study in MLflow and in Optuna's dashboard, as a browser shows them.
+"""Take screenshots of a study in MLflow and in Optuna Dashboard.
 
     python -m benchmarks.sweeps.screenshots [FOLDER]
 
-The study takes some minutes; it is kept in the folder (`screenshots` where none is named), and not run again. It needs
-Chromium and its driver (`apt-get install chromium chromium-driver`).
+The study takes a few minutes; it is kept in the folder (default: `screenshots`) and not repeated. Needs Chromium and
+its driver (`apt-get install chromium chromium-driver`).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ WIDTH_PX, N_COLOURS = 1400, 256
 
 
 def look_at_study(address: str, file: Path) -> None:
-    """Keep what the dashboard shows of the study: history, importance of each key, and when each trial ran."""
+    """Save a screenshot of the study in the dashboard: history, importance of each key, and timeline."""
     with tempfile.TemporaryDirectory() as profile, chromium(Path(profile), width=1750, height=1180) as browser:
         browser.open(f"{address}/dashboard/studies/0")
         browser.count(".scatterlayer .points path", at_least=N_TRIALS)
@@ -44,7 +44,7 @@ def look_at_study(address: str, file: Path) -> None:
 
 
 def look_at_runs(address: str, file: Path) -> None:
-    """Keep what MLflow shows where `armscan ui` leads: the run of the study, and those of its trials below it."""
+    """Save a screenshot of the MLflow page that `armscan ui` prints: the study's run, its trials' runs below it."""
     client = open_existing_store("sqlite:///mlruns.db")
     experiment = client.get_experiment_by_name("armscan")
     (study,) = client.search_runs([experiment.experiment_id], f"attributes.run_name = 'study {NAME}'")
@@ -56,7 +56,7 @@ def look_at_runs(address: str, file: Path) -> None:
 
 
 def make_small(file: Path) -> None:
-    """Make a picture as wide and as small as a page needs it."""
+    """Scale a picture to the width of a page, and reduce its colours."""
     with Image.open(file) as image:
         height = round(image.height * WIDTH_PX / image.width)
         small = image.convert("RGB").resize((WIDTH_PX, height), Image.Resampling.LANCZOS)
@@ -65,7 +65,7 @@ def make_small(file: Path) -> None:
 
 
 def main() -> None:
-    """Run the study where it is not there, and keep the pictures."""
+    """Run the study unless it is finished, and save the pictures."""
     folder = Path(sys.argv[1] if len(sys.argv) > 1 else "screenshots")
     folder.mkdir(parents=True, exist_ok=True)
     os.chdir(folder)

@@ -1,7 +1,7 @@
-"""Searches by armscan and by Hydra's Optuna sweeper with a budget of processor time; both train in this process.
+"""Search with armscan and with Hydra's Optuna sweeper on a budget of processor time; both train in this process.
 
-The processor time of a trial is that of this process while the trial's task runs, all threads together: building,
-training, validating, tracking and reporting. Neither side is charged for a start of a process, nor for its sampler.
+A trial costs the processor time of this process, all threads together, while the trial's task runs: building,
+training, validating, tracking and reporting. Neither side pays for starting processes, nor for its sampler.
 """
 
 from __future__ import annotations
@@ -71,11 +71,11 @@ class Meter:
         self.budget_s, self.used_s = budget_s, 0.0
 
     def is_used(self, kept_s: float = 0.0) -> bool:
-        """Return whether no more than these processor seconds are left."""
+        """Return whether at most `kept_s` processor seconds are left."""
         return self.used_s + kept_s >= self.budget_s
 
     def timed(self, run: Callable[[Attempt], dict[str, float]]) -> Callable[[Attempt], dict[str, float]]:
-        """Return a task that is measured."""
+        """Return a task whose processor time is added to the used time."""
 
         def timed(attempt: Attempt) -> dict[str, float]:
             start_s = time.process_time()
@@ -101,7 +101,7 @@ class BudgetedScheduler(TrialScheduler):
 
 
 def search_by_armscan(words: Sequence[str], budget_s: float, _: Path) -> SearchResult:
-    """Search by a study of armscan: half of the budget for the search, the rest for the race."""
+    """Search with a study of armscan: half of the budget for the search, the rest for the race."""
     opened = open_for_work(*read_settings(words), words)
     assert opened.final_eval is not None
     meter, final = Meter(budget_s), opened.final_eval
@@ -118,13 +118,13 @@ def search_by_armscan(words: Sequence[str], budget_s: float, _: Path) -> SearchR
 
 
 def chosen_of(scores: Scores, seeds: Sequence[int], settings: FinalEvalSettings) -> int | None:
-    """Return the choice of the longest race whose rounds are complete; None if not even one seed of each is.
+    """Return the choice of the longest race with complete rounds; None unless each candidate has its first seed.
 
     Args:
         scores: See `race`.
         seeds: All seeds of the race.
-        settings: Their `mean_seeds` are those of the longest race; their `min_seeds` are those of the first round, or
-            fewer if it is not complete.
+        settings: Their `mean_seeds` is that of the longest race, their `min_seeds` that of the first round, which is
+            shortened if it is not complete.
     """
     means = range(settings.mean_seeds, 0, -1)
     shorter = (race(scores, seeds, min_seeds=min(n, settings.min_seeds), mean_seeds=n) for n in means)
@@ -132,7 +132,7 @@ def chosen_of(scores: Scores, seeds: Sequence[int], settings: FinalEvalSettings)
 
 
 def search_by_hydra(words: Sequence[str], budget_s: float, folder: Path) -> SearchResult:
-    """Search by Hydra's Optuna sweeper, whose trials are trained as those of a study without a pruner."""
+    """Search with Hydra's Optuna sweeper; its trials are trained as in a study without a pruner."""
     words = [*words, "study/pruner=none", "study.final_eval.top_k=0"]
     opened, meter = open_for_work(*read_settings(words), words), Meter(budget_s)
     study, storage = opened.search.scheduler.study, f"sqlite:///{folder.absolute()}/hydra.db"
@@ -146,7 +146,7 @@ def search_by_hydra(words: Sequence[str], budget_s: float, folder: Path) -> Sear
                 process.terminate()
                 break
             study.enqueue_trial(fixed_by(json.loads(line)))
-            # A plan without trials: those that are enqueued are all.
+            # An empty plan: only enqueued trials run.
             _work(opened.search, words, meter, lambda: False, list)
             print(study.get_trials()[-1].values[0], file=process.stdin, flush=True)
     assert meter.is_used(), f"the sweeper ended early: see {folder / 'hydra.log'}"

@@ -1,4 +1,4 @@
-"""A trial that only takes its time: what is left of a study without training is the platform."""
+"""Trials that only wait: without training, only the platform's overhead remains of a study."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ STEPS_A_PART = 100
 
 
 class Sleeping:
-    """The task of waiting, with ten reports; see `wait`."""
+    """A task that waits and reports ten times; see `wait`."""
 
     final_metric = "test/mean_steps"
 
@@ -28,7 +28,7 @@ class Sleeping:
         check_keys(config)
 
     def run(self, attempt: Attempt) -> dict[str, float]:
-        """Wait; the value is what `agent.lr` is."""
+        """Wait; return `agent.lr` as the value."""
         (seed,) = attempt.seeds
         config, _ = attempt.config(seed)
         value = float(config.agent.lr)

@@ -1,4 +1,4 @@
-"""The waiting that trials do instead of a training; it needs nothing but Python, so that any platform can run it."""
+"""The waiting that trials do instead of training; it needs only Python, so that any platform can run it."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ class Waited(NamedTuple):
     """Record of a trial.
 
     Args:
-        length_s: Seconds that it had to wait.
-        begin_s: Time when it began, on the clock that all processes share.
-        end_s: Time when it ended.
+        length_s: Seconds that the trial was to wait.
+        begin_s: Start time in seconds, on the clock that all processes share.
+        end_s: End time in seconds.
     """
 
     length_s: float
@@ -28,12 +28,12 @@ class Waited(NamedTuple):
 def wait(
     number: int, shortest_s: float, longest_s: float, on_part: Callable[[int], None] = lambda part: None
 ) -> Waited:
-    """Wait as long as the trial of this number takes, on any platform.
+    """Wait as long as the trial with this number takes on every platform.
 
     Args:
         number: Number of the trial.
         shortest_s: Shortest wait in seconds.
-        longest_s: Longest wait in seconds; lengths are spread evenly between the two.
+        longest_s: Longest wait in seconds; waits are uniformly distributed between the two.
         on_part: Function called after each of the `N_PARTS` parts with its number, from 1; its time counts as waiting.
     """
     length_s = random.Random(number).uniform(shortest_s, longest_s)

@@ -20,7 +20,7 @@ def agent_of(algorithm, phantom, projection="y"):
 
 
 def planes(agent, n, seed=0, bounds=BOUNDS, rewards=()):
-    """Return the first planes of an episode, told the reward of the one before each; -0.5 where none is given."""
+    """Return the first planes of an episode; the agent is told `rewards` for them, and -0.5 after those."""
     agent.begin(seed=seed, bounds=bounds)
     told = [-0.9, *rewards] + [-0.5] * n
     return np.array([agent.act(np.zeros(3, np.float32), reward) for reward in told[:n]])
@@ -81,7 +81,7 @@ def test_sweep_stays_at_the_best_plane_after_all_were_seen(phantom):
     agent = agent_of(Exhaustive(), phantom)
     swept = planes(agent, 9, bounds=bounds, rewards=[-0.7, -0.6, -0.2, -0.6, -0.5, -0.2, 0.0, 0.0])
     np.testing.assert_allclose((swept[:5, 0] + 1) * 11, [11, 6, 16, 1, 21])
-    # What comes after all were seen is their best again, and is not counted.
+    # After the sweep, its best plane is repeated, and further rewards are ignored.
     assert (swept[5:] == swept[2]).all()
 
 

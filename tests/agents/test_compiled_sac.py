@@ -1,4 +1,4 @@
-"""The compiled update of SAC, held to Tianshou's own."""
+"""The compiled update of SAC, compared with Tianshou's own."""
 
 import hashlib
 import math
@@ -77,7 +77,7 @@ def compiled(replay, compute=None, **arguments):
 
 
 def updated(each, replay, n, *, batch_size=32, seed=1, at_once=1):
-    """Return the figures of n gradient steps, means of as many as are taken at once."""
+    """Return the statistics of n gradient steps, as means over the steps taken at once."""
     replay.seed(seed)
     torch.manual_seed(seed)
     with policy_within_training_step(each.policy):
@@ -99,7 +99,7 @@ def differences(one, other):
 
 
 def hand_over(source, target):
-    """Give one algorithm the other's state, as a checkpoint does."""
+    """Load the state of one algorithm into another, as a checkpoint does."""
     if isinstance(source.alpha, sac.AutoAlpha):
         target.alpha._optim.load_state_dict(deepcopy(source.alpha._optim.state_dict()))
     target.load_state_dict(deepcopy(source.state_dict()))
@@ -132,10 +132,10 @@ def test_compiled_updates_agree_with_those_of_tianshou(hidden_sizes, n_obs, n_ac
             assert one.pop("gradient_steps") == 1
             assert one.keys() == other.keys()
             np.testing.assert_allclose(list(one.values()), list(other.values()), rtol=1e-4, atol=1e-4)
-        # Adam makes a whole step of what rounding leaves of a gradient of 0, so that single weights differ by more.
+        # Adam turns the rounding error of a zero gradient into a full step, so that single weights differ by more.
         assert np.quantile(differences(ours, theirs), 0.99) < 1e-4
         assert_same_state(ours, theirs, 5e-3)
-        # Or else the differences would grow as those of any two trainings do.
+        # Otherwise the differences would grow, as between any two trainings.
         hand_over(theirs, ours)
 
 
@@ -172,11 +172,11 @@ def test_updates_at_once_are_those_one_by_one_to_the_bit(at_once):
     assert_same_state(one_by_one, at_once_too, 0.0)
 
 
-# Takes updates with as many threads as it is told, and writes the sum of all weights and of Adam's state.
+# Updates on the given number of threads, and prints the digest of all weights and of Adam's state.
 THREADS = """
 import sys, torch
 from tests.agents.test_compiled_sac import *
-# The weights to begin with come from LAPACK, which a learner has on one thread.
+# The initial weights come from LAPACK, which a learner runs on one thread.
 torch.set_num_threads(1)
 replay = filled_replay(14, 1)
 ours = compiled(replay, hidden_sizes=[64, 64], n_obs=14, n_action=1)
@@ -192,7 +192,7 @@ def digest(each):
 
 
 def test_updates_are_the_same_to_the_bit_on_any_number_of_threads():
-    """Products of 256 x 64 x 64 are large enough for BLAS to share them out."""
+    """Products of 256 x 64 x 64 are large enough for BLAS to split them between threads."""
     digests = set()
     for n in ("1", "2"):
         limits = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), n)
@@ -215,7 +215,7 @@ def test_fork_goes_on_with_updates_that_its_parent_has_begun():
     reader, writer = os.pipe()
     child = os.fork()
     if child == 0:
-        # Ends without pytest's own end, even after an error.
+        # Exits without pytest's teardown, even after an error.
         try:
             updated(ours, replay, 4, seed=2, at_once=2)
             os.write(writer, digest(ours).encode())

@@ -1,4 +1,4 @@
-"""The replay buffer of images gives what a plain one gives, and keeps no frame that it does not need."""
+"""The replay buffer of images returns what a plain one returns, and keeps no frame that it does not need."""
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ def envs(request, phantom):
 
 
 def played(envs, n_steps, seed=0):
-    """Yield the transitions of all environments, a batch a step; episodes end after four steps at the latest."""
+    """Yield the transitions of all environments, one batch per step; episodes end after four steps at the latest."""
     envs.action_space.seed(seed)
     observations, _ = envs.reset(seed=seed)
     for _ in range(n_steps):
@@ -66,7 +66,7 @@ def assert_same(one, other):
 
 
 def assert_gives_the_same(image, to_plain):
-    """By every way that transitions are asked for."""
+    """Check every way to read transitions."""
     assert len(image) == len(to_plain)
     everything = to_plain.sample_indices(0)
     assert_same(to_plain[everything], image[everything])
@@ -83,8 +83,8 @@ def assert_frames_are_those_referred_to(replay):
     for name, images in replay._images.items():
         ids = np.concatenate([replay._meta[key][name].ravel() for key in ("obs", "obs_next")])
         counted = dict(zip(*np.unique(ids[ids != 0], return_counts=True), strict=True))
-        folder_lock = {i: n for i, n in enumerate(images.frames._n_references) if n}
-        assert folder_lock == counted
+        references = {i: n for i, n in enumerate(images.frames._n_references) if n}
+        assert references == counted
         assert len(images.frames) == len(counted)
 
 
@@ -120,12 +120,12 @@ def test_no_frame_is_kept_twice_within_an_episode(phantom):
     replay = replay_for(envs.single_observation_space, 100, 1)
     for batch in played(envs, 30):
         replay.add(batch)
-    # The first frame, and one a step.
+    # The first frame, and one per step.
     assert len(replay._images["slice"].frames) <= 31
 
 
 def noise(rng, n_envs=2, shape=(2, 5, 7)):
-    """Transitions whose frames have nothing to do with each other."""
+    """Return transitions whose frames are unrelated."""
     obs, obs_next = (
         Batch(noise=rng.integers(0, 256, (n_envs, *shape), dtype=np.uint8), number=rng.random((n_envs, 1)))
         for _ in range(2)
@@ -158,7 +158,7 @@ def test_what_was_asked_for_before_is_not_given_for_what_came_later(n_between):
     rng = np.random.default_rng(0)
     to_plain, image = Replay(2, 2), ImageReplay(2, 2, NOISE)
     for _ in range(8):
-        # Ids of frames come back with other frames.
+        # IDs are reused for other frames.
         for batch in [noise(rng) for _ in range(n_between)]:
             for replay in (to_plain, image):
                 replay.add(batch)
@@ -196,7 +196,7 @@ def test_replay_goes_on_from_a_checkpoint_bit_for_bit(envs, tmp_path, n_steps):
         Replay(18, N_ENVS),
         *(replay_for(envs.single_observation_space, 18, N_ENVS) for _ in range(2)),
     )
-    # What it had before has no part in anything.
+    # Its earlier contents must not matter.
     for batch in played(envs, 4, seed=5):
         other.add(batch)
     for batch in played(envs, n_steps):

@@ -1,4 +1,4 @@
-"""Actions of many observations at once, each as if it were alone."""
+"""Actions of many observations at once, each the same as alone."""
 
 import numpy as np
 import torch

@@ -141,7 +141,7 @@ def test_learner_goes_on_from_a_checkpoint_bit_for_bit(make_learner, tmp_path):
     save_checkpoint(tmp_path / "last.pt", learner.state(), {})
     other = make_learner()
     other.load_state(load_checkpoint(tmp_path / "last.pt")[0])
-    # What is drawn elsewhere in between must change nothing.
+    # Random numbers drawn elsewhere in between must change nothing.
     torch.rand(7), np.random.rand(7)  # noqa: NPY002
     for each in (learner, other):
         each.learn(20)

@@ -73,7 +73,7 @@ def test_search_is_told_every_reward_but_the_starts(phantom):
 
 
 def test_search_begins_with_as_many_random_planes_as_wanted(phantom):
-    # TPE and the Gaussian process draw their first planes alike, until the model takes over.
+    # Both draw the same random planes until the model takes over.
     few, many = (
         played(agent_of(OptunaSearch(n_startup_trials=n), phantom, 1), 10, seed=1)[0].ravel().tolist() for n in (2, 10)
     )

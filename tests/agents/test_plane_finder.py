@@ -74,7 +74,7 @@ def test_learner_goes_on_from_its_state_to_the_bit(phantom):
 
 
 def test_looks_lie_beside_what_is_found_and_the_last_on_it(phantom):
-    """Every next look of a network that always says "2 mm on, not tilted" is known."""
+    """The looks of a network that always predicts 2 mm ahead without tilt are known."""
     learner, env = made(phantom)
     learner.load_weights(
         {name: torch.zeros_like(w) if "place." in name else w for name, w in learner.weights().items()}
@@ -89,7 +89,7 @@ def test_looks_lie_beside_what_is_found_and_the_last_on_it(phantom):
 
 
 def answers_of(learner, env):
-    """Return the actions of a learner, of its policy, and of the program made of that, for the same observations."""
+    """Return the actions of a learner, of its policy, and of the program exported from that, for the same looks."""
     observations = []
     for seed in range(3):
         observation, _ = env.reset(seed=seed)

@@ -1,4 +1,4 @@
-"""Planes in the frames of others, for tensors, against what is computed one by one."""
+"""Planes in the frames of others, for tensors, compared with computing them one by one."""
 
 import numpy as np
 import pytest
@@ -42,7 +42,7 @@ def test_a_plane_is_found_again_from_where_another_sees_it(geometry):
     planes, others = drawn(0), drawn(1)
     found = geometry.from_frame(planes, geometry.seen_from(planes, others), torch.zeros(len(planes)).double())
     np.testing.assert_allclose(geometry.errors(found, others), 0.0, atol=1e-5)
-    # Its picture is where it was, but for what the depth of its middle changes.
+    # Its slice hardly moves across: only the depth of its middle changes that.
     assert (found - others)[:, 2].abs().median() < 1.0
 
 
@@ -59,7 +59,7 @@ def test_a_plane_beside_another_is_parallel_and_as_far_along_the_normal(geometry
 
 def test_planes_slide_into_the_bounds_as_one_by_one(geometry):
     outside = drawn(2) + torch.tensor([0.0, 0.0, -45.0, 0.0])
-    # Through a point of it, as far across as the middle of its slice.
+    # Through the middle of its slice.
     found = geometry.through(geometry.normals(outside), geometry.middles(outside))
     for plane, shifted in zip(one_by_one(outside), found.numpy(), strict=True):
         expected = shift_into(plane, BOUNDS.translation_mm)

@@ -1,4 +1,4 @@
-"""A learner's policy alone: its answers on every device, and its file."""
+"""A learner's policy alone: its answers, and its ONNX file."""
 
 import numpy as np
 import onnxruntime
@@ -100,7 +100,7 @@ def test_policy_of_a_compiled_network_is_a_plain_one(phantom):
 
 
 class Fussy(nn.Module):
-    """An actor that looks at its numbers before it says anything."""
+    """An actor whose control flow depends on values, which cannot be exported."""
 
     def __init__(self):
         super().__init__()

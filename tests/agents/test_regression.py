@@ -26,7 +26,7 @@ def test_optimal_actions_are_those_of_each_environments_episode(phantom):
     assert terminated.all()
     assert (rewards > -0.05).all()
     np.testing.assert_allclose(infos["distance_mm"], 0, atol=1e-4)
-    # The others go on with their episodes.
+    # The others continue their episodes.
     envs.reset(options={"reset_mask": np.array([False, True, False])})
     changed = (envs.optimal_actions != optima).any(axis=1)
     assert changed.tolist() == [False, True, False]

@@ -53,6 +53,12 @@ def test_teaching_ends_with_its_steps_and_the_rest_is_for_sac(phantom):
     assert learner.n_env_steps == N_TAUGHT + 40
 
 
+def test_pretraining_takes_its_own_steps_also_if_sac_collects_more_at_once(phantom):
+    learner, _ = made(phantom, sac=SAC(network=MLP((8,)), **SMALL_SAC | {"env_steps_per_collection": 20}))
+    learner.learn(N_TAUGHT)
+    assert learner.n_env_steps == N_TAUGHT
+
+
 @pytest.mark.parametrize("n_averaged", [1, 2])
 def test_corrections_begin_after_the_teaching_and_leave_the_plane_finder_as_it_is(phantom, n_averaged):
     learner, env = made(phantom, n_averaged=n_averaged)
@@ -80,7 +86,7 @@ def test_corrections_stay_within_their_limits(corrected):
 
 @pytest.mark.parametrize("n_before", [1, 2])
 def test_learner_goes_on_from_its_state_to_the_bit(phantom, n_before):
-    """Also from the end of the teaching."""
+    """Also from the end of the pretraining."""
     one, other = made(phantom)[0], made(phantom)[0]
     for _ in range(n_before):
         one.learn(40)

@@ -63,7 +63,7 @@ def test_learner_with_a_schedule_goes_on_from_any_epoch_bit_for_bit(make_schedul
     whole, first, second = (make_scheduled() for _ in range(3))
     learned(first, resumed_at)
     second.load_state(first.state())
-    # As a process that is started again draws other numbers in between.
+    # A restarted process draws other numbers in between.
     torch.rand(7)
     assert are_equal(learned(whole, 120), learned(second, 120))
 

@@ -1,4 +1,4 @@
-"""The collector, held to Tianshou's own."""
+"""The collector, compared with Tianshou's own."""
 
 from dataclasses import fields
 
@@ -27,10 +27,7 @@ MEASURED_S = ("collect_time", "collect_speed")
 
 @pytest.fixture
 def of_tianshou(monkeypatch):
-    """Make learners collect by Tianshou's collector into Tianshou's buffer."""
-
-    def add(self, batch, buffer_ids=None):
-        return VectorReplayBuffer.add(self, Batch(batch), buffer_ids)
+    """Return a function that makes learners use Tianshou's collector and buffer."""
 
     def switch():
         monkeypatch.setattr(

@@ -55,7 +55,7 @@ def test_tianshou_vector_env_counts_episodes_and_those_that_succeed(make, phanto
     for _ in range(12):
         _, rewards, terminated, truncated, _ = envs.step(rng.uniform(-1, 1, (3, 3 if ends == "on_stop" else 2)))
         is_over = terminated | truncated
-        # An episode succeeds that ends on a rewarded plane.
+        # An episode succeeds if its last plane scores above -success_threshold.
         n_ended, n_successes = n_ended + is_over.sum(), n_successes + (rewards[is_over] > -0.6).sum()
         if is_over.any():
             envs.reset(np.flatnonzero(is_over))
@@ -72,7 +72,7 @@ def test_tianshou_vector_env_gives_images_as_batches(make):
 
 
 def test_collector_steps_the_vector_environment(make, phantom, monkeypatch):
-    """Tianshou's own collector, on environments of our factory: all planes of a step are looked at together."""
+    """A learner's collector, on environments of our factory: all planes of a step are looked at together."""
     from armscan.agents import MLP, SAC
     from armscan.anatomy import Scanner
 

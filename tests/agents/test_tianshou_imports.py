@@ -17,6 +17,6 @@ print(Figure.__module__, SummaryWriter.__module__)
 
 
 def test_packages_are_not_imported_with_tianshou_and_can_be_imported_afterwards() -> None:
-    """In a process of its own: here, other tests have imported them."""
+    """In its own process: here, other tests have imported them."""
     printed = subprocess.run([sys.executable, "-c", PROGRAM], check=True, capture_output=True, text=True).stdout
     assert printed.splitlines() == ["[]", "matplotlib.figure torch.utils.tensorboard.writer"]

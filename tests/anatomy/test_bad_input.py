@@ -1,4 +1,4 @@
-"""Wrong arguments: accepted where they are right after all, else refused by one of the project's own exceptions."""
+"""Arbitrary arguments: accepted if they are valid, otherwise refused by one of the project's own exceptions."""
 
 import numpy as np
 import pytest

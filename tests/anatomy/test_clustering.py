@@ -42,7 +42,7 @@ def slices(draw):
 @settings(max_examples=250, deadline=None)
 @given(
     slice_xz=slices(),
-    # From discs of one pixel to such as hold more than 255 and more than 65,535 pixels.
+    # From discs of one pixel to discs of more than 255 and more than 65,535 pixels.
     eps=st.sampled_from([0.5, 1.0, 1.1, 1.5, 2.0, 2.3, 3.0, 4.1, 5.0, 6.7, 9.3, 60.0, 150.0]),
     min_samples=st.integers(1, 50) | st.integers(200, 900),
 )
@@ -67,7 +67,7 @@ def test_cluster_label_equals_sklearns_dbscan(slice_xz, eps, min_samples):
 @settings(max_examples=100, deadline=None)
 @given(
     slice_xz=slices(),
-    # No multiples of one another: scikit-learn rounds distances that equal eps now up, now down.
+    # No multiples of one another: scikit-learn rounds distances that equal eps up or down.
     eps_mm=st.sampled_from([0.31, 0.77, 1.63, 2.91]),
     density=st.sampled_from([0.1, 0.5, 0.62, 0.94, 1.0]),
     pixel_mm=st.tuples(st.sampled_from([0.13, 0.27, 0.55]), st.sampled_from([0.271, 0.553, 1.01])),

@@ -1,4 +1,4 @@
-"""The window in which a person moves the plane."""
+"""The window in which the user moves the plane."""
 
 import gc
 import subprocess

@@ -9,7 +9,7 @@ N_SEEDS, N_EPOCHS = 4, 10
 
 
 def true_log(place):
-    """Return the logarithm of the true mean steps of a place: the learning rate matters most, the batch not."""
+    """Return the logarithm of the true mean steps at a place: the learning rate matters most, the batch size not."""
     return 0.5 + 6.0 * (place[0] - 0.6) ** 2 + 0.3 * place[1] + 1.5 * (place[2] - 0.7) ** 2
 
 
@@ -18,7 +18,7 @@ def synthetic_curves(n_configs, chance=0.1):
     design, rng = Design.of("sac_y", n_configs), np.random.default_rng(0)
     config_of = np.repeat(np.arange(n_configs), N_SEEDS)
     worth = np.array([true_log(places_of(design.space, values)) for values in design.configs])[config_of]
-    # A seed is lucky all along, and a validation of its own.
+    # Noise of a seed in all of its evaluations, and of each evaluation.
     logs = worth[:, None] + 3.0 * np.exp(-np.arange(N_EPOCHS + 2) / 2.0)
     logs = logs + rng.normal(0.0, chance, (len(worth), 1)) + rng.normal(0.0, chance / 4, logs.shape)
     steps = np.exp(logs.clip(0.0, np.log(50.0)))

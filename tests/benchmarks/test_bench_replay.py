@@ -54,7 +54,7 @@ def test_chance_is_as_large_as_in_the_table(surrogate):
     places = sobol(len(surrogate.space.parameters), 30)
     configs = [surrogate.config(values_at(surrogate.space, row)) for row in places]
     logs = np.log([[config.train(rng).test for _ in range(200)] for config in configs])
-    # Of a seed 0.1, and of its test 0.025.
+    # Standard deviation 0.1 between seeds, and 0.025 of a test.
     assert np.sqrt(logs.var(axis=1).mean()) == pytest.approx(0.103, rel=0.1)
 
 
@@ -94,7 +94,7 @@ def test_a_choice_with_equal_seeds_has_all_of_them_and_a_race_ends_early():
 def test_trainings_that_a_regret_needs_are_interpolated():
     n_trainings = np.array([3.0, 6.0, 12.0])
     assert needed_for(0.3, np.array([0.4, 0.2, 0.1]), n_trainings) == pytest.approx(4.5)
-    # Chance lets a curve rise again.
+    # Noise lets a curve rise again.
     assert needed_for(0.2, np.array([0.4, 0.2, 0.3]), n_trainings) == pytest.approx(6.0)
     assert needed_for(0.05, np.array([0.4, 0.2, 0.1]), n_trainings) == np.inf
     assert needed_for(0.5, np.array([0.4, 0.2, 0.1]), n_trainings) == pytest.approx(3.0)
@@ -120,7 +120,7 @@ def test_seeds_that_a_comparison_needs_follow_from_chance():
     power = power_of(Surrogate.of(synthetic_curves(40)), n_comparisons=2000)
     assert power.loc[0.0, 20] == pytest.approx(0.05, abs=0.02)
     assert power.loc[0.2, 10] > power.loc[0.1, 10] > power.loc[0.05, 10]
-    # Of a normal chance of 0.103, n = 2 (1.96 + 0.84)^2 (0.103 / log(1.2))^2 = 5 for large samples, and one for the t.
+    # For normal noise of 0.103, n = 2 (1.96 + 0.84)^2 (0.103 / log(1.2))^2 = 5 by a z test, and one more by a t test.
     assert needed_seeds(power)[0.2] in (6, 8)
 
 

@@ -1,4 +1,4 @@
-"""Rules of seeds for many choices at once: those of armscan are its race, the others are what they are named after."""
+"""Seed rules for many choices at once: armscan's is its race, the others do what they are named after."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def test_same_number_of_seeds_drops_nobody():
 
 def test_halving_gives_the_better_half_twice_as_many_seeds():
     found = halving(3)(scores_of([0.0, 20.0, 10.0, 0.0, 0.0]))
-    # Of five three go on, then two, then one.
+    # Of five configurations three go on, then two, then one.
     assert set(found.n_trainings) == {5 * 3 + 3 * 3 + 2 * 6}
     assert set(found.place) == {1}
 
@@ -60,5 +60,5 @@ def test_budget_is_allocated_to_those_close_to_the_best():
     assert set(found.n_trainings) == {18}
     close = (found.place < 2).mean()
     assert close == 1.0
-    # It tells the two better apart than the same seeds for all do.
+    # It tells the two apart about as well as the same seeds for all do, or better.
     assert (found.place == 1).mean() > (fixed(6)(scores).place == 1).mean() - 0.1

@@ -106,7 +106,7 @@ def test_a_table_is_added_to_by_the_same_command(tmp_path):
     file = tmp_path / "sac_y.csv.gz"
     collect("sac_y", 1, 1, overrides=SMALL, file=file)
     first = read_rows(file)
-    # Whole collections of the agent.
+    # Epochs end after whole collections of the agent.
     assert list(zip(first.volumes, first.env_steps, strict=True))[:2] == [("validation", 288), ("validation", 512)]
     collect("sac_y", 2, 1, overrides=SMALL, file=file)
     rows = read_rows(file)

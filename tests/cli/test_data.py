@@ -1,4 +1,4 @@
-"""The command that tells what is in a folder of volumes."""
+"""The command that shows what is in a folder of volumes."""
 
 import subprocess
 import sys
@@ -7,7 +7,7 @@ from armscan.cli.main import main
 
 
 def test_data_command_tells_what_each_volume_holds(write_labelmap, tmp_path, monkeypatch, capsys):
-    # Workers of pytest-xdist have it.
+    # Set in the workers of pytest-xdist.
     monkeypatch.delenv("COLUMNS", raising=False)
     write_labelmap("a.nrrd")
     write_labelmap("b.nrrd")

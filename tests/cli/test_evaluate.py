@@ -1,4 +1,4 @@
-"""The words of `armscan evaluate`."""
+"""The arguments of `armscan evaluate`."""
 
 from functools import partial
 
@@ -10,7 +10,7 @@ from tests.test_run import runs_in
 
 @pytest.fixture(autouse=True)
 def tracking_database(database):
-    """Spare each test the making of MLflow's tables."""
+    """Give each test a database that has MLflow's tables already."""
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""The program: its commands with good and bad words, how it ends, what it loads."""
+"""The program: its commands with good and bad arguments, its exit codes, and what it imports."""
 
 import os
 import subprocess
@@ -15,7 +15,7 @@ from armscan.errors import VolumeError
 
 
 def commands(group=program, path=()):
-    """Every command with its path, `run` excepted, which is Hydra's."""
+    """Yield every command with its path, except `run`, which is Hydra's."""
     for name, command in group.commands.items():
         if isinstance(command, click.Group):
             yield from commands(command, (*path, name))
@@ -134,7 +134,7 @@ def test_classes_in_the_current_folder_are_found(words, tmp_path):
     (tmp_path / "conf/agent/middle.yaml").write_text("_target_: own_agent.Middle\n")
 
     def error():
-        # -P: as the installed program, which knows nothing of the current folder.
+        # -P: like the installed program, which does not have the current folder on its path.
         command = [sys.executable, "-P", "-m", "armscan", *words]
         return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True).stderr
 

@@ -1,4 +1,4 @@
-"""The command that exports and registers policies, as a person types it, on real tracked runs."""
+"""The commands that export and register policies, as a user types them, on real tracked runs."""
 
 import json
 import shutil
@@ -186,7 +186,7 @@ def test_damaged_checkpoint_is_told_and_changes_nothing(answer, tmp_path):
 
 
 def registered(answer, folder, *words):
-    """Return a run whose policy is registered: its id, and the folder of the model among its artifacts."""
+    """Register the policy of a new run; return the run's ID, and the folder of the model among its artifacts."""
     run_id = tracked(folder, *words)
     assert answer("register", run_id, "--name=n")[0] == 0
     return run_id, folder / "artifacts" / run_id / "artifacts" / "policy"
@@ -219,7 +219,7 @@ def test_policy_of_another_run_is_not_registered_in_the_place_of_the_kept_one(an
     assert is_refused()
     assert versions_in(tmp_path) == before
 
-    # As earlier versions have left it: nothing says that it is the one that was kept.
+    # As left by earlier versions: nothing says that it is the one that was kept.
     store_of(tmp_path).delete_tag(run_id, SUM_TAG)
     assert answer("register", run_id, "--name=n")[0] == 0
     assert mlflow.pyfunc.load_model("models:/n/3").metadata.metadata["run"] == run_id
@@ -251,7 +251,7 @@ def test_policy_is_not_registered_with_a_damaged_evaluation(answer, tmp_path):
     ("part", "beginning"),
     [
         ("", "the artifacts of runs lie in "),
-        # Which is met when the model is there already.
+        # Noticed only once the model is made.
         ("{run_id}/artifacts", "tracking.uri is 'sqlite:///"),
     ],
     ids=["all", "the run's"],

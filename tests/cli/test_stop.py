@@ -1,4 +1,4 @@
-"""`armscan runs stop` of studies, trials and what is none."""
+"""`armscan runs stop` on studies, trials, and what is neither."""
 
 from functools import partial
 
@@ -17,7 +17,7 @@ def answer(armscan):
 
 @pytest.fixture
 def study(tmp_path):
-    """Return a study with a trial that runs, and one that has ended."""
+    """Return a study with a running trial, and one that has ended."""
     study = optuna.create_study(study_name="a", storage=open_storage(str(tmp_path / "optuna.journal")).optuna)
     for name in ("objectives", "space", "fixed_config"):
         study.set_user_attr(name, {"x": "minimize"} if name == "objectives" else {})

@@ -1,4 +1,4 @@
-"""Runs that a stranger has made: no command executes what they name."""
+"""Runs made by a stranger: no command executes what they name."""
 
 import json
 import re
@@ -17,7 +17,7 @@ from armscan.utils.files import CONFIG_FILE, SHA256_TAGS, VOLUMES_FILE, sha256
 from tests.cli.test_policy import registered
 from tests.support.tracked_runs import GUESSER, store_of, tracked
 
-# Of libraries that are always there; Hydra builds each without a word.
+# Targets in libraries that are always installed; Hydra would call each without asking.
 DOORS = {
     "a shell": lambda marker: {"_target_": "torch.utils.collect_env.run", "command": f"touch {shlex.quote(marker)}"},
     "a process": lambda marker: {"_target_": "subprocess.check_output", "args": ["touch", marker]},
@@ -37,13 +37,13 @@ COMMANDS = {
 
 @pytest.fixture(autouse=True)
 def working_folder(database, tmp_path, monkeypatch):
-    """Return a folder with the store in which the user looks."""
+    """Work in a folder with the user's store."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path}/mlruns.db")
 
 
 def run_with(folder, text=None, **sections):
-    """Track a run, replace its configuration or sections of it, and let its tag say that it was started so."""
+    """Track a run, replace its configuration or sections of it, and adapt the tag with its checksum."""
     run_id = tracked(folder)
     file, client = folder / CONFIG_FILE, store_of(folder)
     file.write_text(text or yaml.safe_dump(yaml.safe_load(file.read_text()) | sections))

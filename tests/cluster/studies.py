@@ -1,4 +1,4 @@
-"""Studies as a person starts them, in PostgreSQL and on an MLflow server, and what must hold of them at the end."""
+"""Studies as a user starts them, in PostgreSQL and on an MLflow server, and checks of their outcome."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.support.postgres import PASSWORD
 from tests.support.waiting import HANG_S, wait_until
 
 REPOSITORY = Path(__file__).parents[2]
-# Files of one's own, in the folder where the command is typed: a worker that does not find them fails every trial.
+# The user's own files, in the working folder of the command: a worker that does not find them fails every trial.
 OWN_FILES = {
     "sweeps/own.yaml": "# @package _global_\ndefaults: [sac_y, _self_]\nstudy: {max_retries: 3}\n",
     "conf/network/own.yaml": "defaults: [auto, _self_]\nvector: {hidden_sizes: [16]}\n",
@@ -55,7 +55,7 @@ TRAINING = [
 
 
 class StartedStudy:
-    """A study that is at work.
+    """A running study.
 
     Args:
         folder: Empty folder that it is started in.
@@ -93,7 +93,7 @@ class StartedStudy:
         return folder
 
     def trials(self, name: str = "sac_y") -> list[FrozenTrial]:
-        """Return its trials, none where it has not been made yet."""
+        """Return its trials; none if it has not been created yet."""
         if name not in optuna.get_all_study_names(self._storage):
             return []
         return optuna.load_study(study_name=name, storage=self._storage).trials
@@ -116,7 +116,7 @@ class StartedStudy:
         os.kill(self.holder(number)["pid"], signal.SIGKILL)
 
     def wait(self, is_there: Callable[[], bool]) -> None:
-        """Wait for a moment while it is at work."""
+        """Wait until a condition is true while the study runs."""
         wait_until(is_there, process=self.process, log=self.told, poll_s=0.1)
 
     def end(self) -> int:
@@ -133,7 +133,7 @@ class StartedStudy:
             self.process.wait()
 
     def told(self) -> str:
-        """Return what the command and its workers have said."""
+        """Return the output of the command and its workers."""
         logs = sorted(self.folder.glob("studies/*/workers/*/worker-*.log"))
         logs += sorted(self.folder.glob("studies/*/workers/*/.submitit/*/*.*[rt]"))
         return "\n".join(f"--- {file.name}\n{file.read_text(errors='replace')}" for file in [self.printed, *logs])
@@ -144,7 +144,7 @@ class StartedStudy:
         return list(self._client.search_runs([experiment.experiment_id], max_results=1000))
 
     def check_complete(self, n_trials: int) -> None:
-        """Check that exactly so many trials have finished, and that each of them is tracked once and whole."""
+        """Check that exactly this many trials are complete, and that each trial is tracked once and whole."""
         trials, runs = self.trials(), self.runs()
         finished = [trial for trial in trials if trial.state == TrialState.COMPLETE]
         assert len(finished) == n_trials, self.told()
@@ -166,19 +166,19 @@ class StartedStudy:
                 assert float(run.data.params["agent.lr"]) == trial.params["agent.lr"]
 
     def check_secret(self) -> None:
-        """Check that the password of the storage is in no file, and in no words of a process."""
+        """Check that the password of the storage is in no file, and in no command line of a process."""
         words = [file for file in Path("/proc").glob("[0-9]*/cmdline") if PASSWORD.encode() in _contents(file)]
         assert words == []
         files = [file for file in self.folder.rglob("*") if file.is_file()]
         assert [file for file in files if PASSWORD.encode() in file.read_bytes()] == []
 
     def worker(self, number: int) -> dict[str, Any]:
-        """Return what a worker has left word of."""
+        """Return the contents of a worker's file."""
         return json.loads((self.workers_folder / f"worker-{number}.json").read_text())
 
 
 def parent_of(pid: int) -> int:
-    """Return the process that has started another."""
+    """Return the ID of a process's parent."""
     return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
 
 

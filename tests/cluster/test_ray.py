@@ -12,7 +12,7 @@ from tests.support.requirements import unavailable
 
 @pytest.fixture(scope="module")
 def cluster():
-    """Enter the cluster: all that follows is on its first machine."""
+    """Start a cluster, and enter its first machine for all that follows."""
     if (reason := why_not_here()) is not None:
         unavailable(reason)
     with (
@@ -39,7 +39,7 @@ def test_study_that_is_told_to_end_hands_its_trials_back(cluster, start):
     study = start(*WAITING, "hydra/launcher=ray", *words, environment=cluster.environment)
     study.holder(0)
     study.holder(1)
-    # Ray takes this signal for itself.
+    # Ray handles this signal itself.
     study.process.terminate()
     assert study.end() == 130, study.told()
     printed = study.printed.read_text()
@@ -62,5 +62,5 @@ def test_study_outlives_a_killed_worker_and_a_machine_that_is_gone(cluster, star
     study.check_secret()
     lost = [trial.user_attrs["failure"] for trial in study.trials() if trial.state.name == "FAIL"]
     assert sorted(reason.rpartition(" on ")[2] for reason in lost) == sorted(numbers)
-    # Ray has begun the other worker again where there is a machine.
+    # Ray has restarted the other worker on the machine that is left.
     assert study.worker(numbers[cluster.other.name])["host"] == cluster.head.name

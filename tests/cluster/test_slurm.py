@@ -1,4 +1,4 @@
-"""Studies whose workers are jobs of a real Slurm: killed, told of their end, and queued again."""
+"""Studies whose workers are jobs of a real Slurm: killed, told of their end, and requeued."""
 
 import os
 import signal
@@ -35,7 +35,7 @@ def job_of(cluster, number):
 def test_study_outlives_a_killed_worker_and_a_killed_job_that_slurm_says_nothing_of(cluster, start):
     study = start(*WAITING, *SLURM, "study.n_trials=4", "study.final_eval.top_k=0", environment=cluster.environment)
     study.kill_worker(0)
-    # That of submitit, above the worker: without it, there is no result that the launcher could wait for.
+    # submitit's process, the worker's parent: without it, the launcher has no result to wait for.
     above = parent_of(study.holder(1)["pid"])
     os.kill(above, signal.SIGKILL)
     assert study.end() == 0, study.told()
@@ -43,13 +43,13 @@ def test_study_outlives_a_killed_worker_and_a_killed_job_that_slurm_says_nothing
     study.check_secret()
     (lost,) = [trial.user_attrs["failure"] for trial in study.trials() if trial.state.name == "FAIL"]
     assert "its worker died" in lost
-    # The other worker was still there to see that it was alone.
+    # The other worker was still running, and noticed that its parent was gone.
     assert "is requeued" in (study.workers_folder / "worker-1.log").read_text()
 
 
 @pytest.mark.slow
 def test_study_goes_on_when_the_launcher_gives_up_for_one_job_that_was_killed(cluster, start, tmp_path_factory):
-    # Accounting needs a database of Slurm's own; what it would say of the jobs is said in its place.
+    # Accounting needs a database of Slurm's own; this script says what it would say of the jobs.
     programs = tmp_path_factory.mktemp("bin")
     accounting = programs / "sacct"
     accounting.write_text(ACCOUNTING)
@@ -69,7 +69,7 @@ def test_jobs_that_are_to_end_hand_their_trials_back_and_go_on_with_them_when_th
     study = start(*TRAINING, *SLURM, *words, environment=cluster.environment)
     study.holder(0)
     study.holder(1)
-    # As before the end of its time, and as by an administrator.
+    # As Slurm does before a job's time limit, and as an administrator does.
     cluster.told("scancel", "--signal=USR2", job_of(cluster, 0))
     cluster.told("scontrol", "requeue", job_of(cluster, 1))
     assert study.end() == 0, study.told()

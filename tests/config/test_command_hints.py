@@ -10,7 +10,7 @@ from armscan.config.command_hints import UV_RUN, armscan_command, kept_command, 
 
 @pytest.fixture
 def environment(tmp_path, monkeypatch):
-    """Yield an environment of this project's in the working folder, with a program and Python; nothing is activated."""
+    """Yield a virtual environment in the working folder, with Python and the program; none is activated."""
     folder = tmp_path / ".venv" / "bin"
     folder.mkdir(parents=True)
     for name in ("python", "armscan"):

@@ -32,7 +32,7 @@ WHOLE = [f"agent={agent}" for agent in choices("agent")] + [f"experiment={name}"
 
 
 ONE_FOLD = [f"data.path={DATA / 'volumes'}", "data.fold=0"]
-# What an agent needs of the environment, and says so without it; and an experiment of its user.
+# What some agents need of the environment, and what some experiments need of their user.
 BESIDE = {
     "agent=plane_finder": ["experiment=plane_finder"],
     "agent=residual_sac": ["experiment=few_wrists_sac", *ONE_FOLD],
@@ -43,8 +43,8 @@ BESIDE = {
 
 @pytest.mark.parametrize("override", WHOLE)
 def test_conf_composes_every_agent_and_experiment(override):
-    # The phantoms are few, so that this is quick; what an experiment says of them is said before.
-    # A reward that is fitted to one wrist alone would not take the labelled plane of another.
+    # Few phantoms, whatever an experiment says, so that this is quick. The threshold is loose, because a reward that is
+    # fitted to one wrist alone would not accept the labelled plane of another.
     few = ["data.n_training=1", "data.n_validation=1", "data.n_test=1", "env.success_threshold=0.5"]
     experiment = build_experiment(compose([override, *BESIDE.get(override, []), *few]))
     env = experiment.env_factory.make_env(experiment.split.test)

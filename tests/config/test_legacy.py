@@ -1,4 +1,4 @@
-"""Runs, checkpoints and studies that the version before the keys were renamed has left."""
+"""Runs, checkpoints and studies left by the version before the keys were renamed."""
 
 import json
 import sqlite3
@@ -20,13 +20,13 @@ AGENTS = ("sac", "ppo", "regression", "optuna")
 
 @pytest.fixture
 def legacy(tmp_path, monkeypatch):
-    """Return the folder in which the earlier version was used; return the address of its store."""
+    """Unpack the folder in which the earlier version was used, and work there; return the address of its store."""
     with tarfile.open(ARCHIVE) as archive:
         archive.extractall(tmp_path, filter="data")
     folder = tmp_path / "legacy"
     for file in (folder / "mlruns.sql", folder / "optuna.journal", *folder.glob("runs/*/tracking/*.jsonl")):
         file.write_text(file.read_text().replace("/FOLDER", str(folder)))
-    # How far an outbox was delivered is kept in bytes.
+    # The delivered part of an outbox is given in bytes.
     for file in folder.glob("runs/*/tracking/*.delivered.json"):
         longer = len(str(folder)) - len("/FOLDER")
         file.write_text(json.dumps({name: end + longer for name, end in json.loads(file.read_text()).items()}))

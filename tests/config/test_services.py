@@ -17,7 +17,7 @@ PASSWORDS = (credentials.STORAGE_PASSWORD, credentials.TRACKING_PASSWORD, creden
 
 @pytest.fixture(autouse=True)
 def here(tmp_path, monkeypatch):
-    """Return an empty folder, in which the user's configuration is, too, and an environment without services."""
+    """Work in an empty folder, which also holds the user's configuration, with no services in the environment."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
     for variable in (*VARIABLES, *PASSWORDS):
@@ -150,8 +150,13 @@ def test_password_comes_from_a_file_where_the_environment_names_one(tmp_path, mo
         read_password("ARMSCAN_STORAGE_PASSWORD")
 
 
-def test_masked_text_has_no_password(monkeypatch):
-    monkeypatch.setenv("ARMSCAN_STORAGE_PASSWORD", "secret")
+@pytest.mark.parametrize("variable", [*PASSWORDS, "MLFLOW_TRACKING_TOKEN", "PGPASSWORD"])
+@pytest.mark.parametrize("is_in_file", [False, True])
+def test_masked_text_has_no_password(tmp_path, monkeypatch, variable, is_in_file):
+    (tmp_path / "file").write_text("secret\n")
+    name, value = (f"{variable}_FILE", str(tmp_path / "file")) if is_in_file else (variable, "secret")
+    monkeypatch.setenv(name, value)
+    monkeypatch.setenv("ARMSCAN_TRACKING_PASSWORD_FILE" if variable != PASSWORDS[1] else "PGPASSWORD_FILE", "nowhere")
     assert mask_passwords("http://a:b@c: secret and postgresql://d@e") == "http://a:***@c: *** and postgresql://d@e"
 
 

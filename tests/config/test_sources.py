@@ -1,4 +1,4 @@
-"""One's own configurations in the working folder, before armscan's own."""
+"""The user's configurations in the working folder, which come before armscan's own."""
 
 from pathlib import Path
 
@@ -63,7 +63,7 @@ def test_own_file_replaces_that_of_the_same_name_and_one_line_says_so(working, c
     compose()
     said = "using ./conf/tracking/mlflow.yaml, ./sweeps/sac_y.yaml instead of armscan's own\n"
     assert capsys.readouterr().err == said
-    # A copy is not worth a word.
+    # A copy of armscan's own file is not mentioned.
     (folder / "conf" / "tracking" / "mlflow.yaml").unlink()
     (folder / "sweeps" / "sac_y.yaml").write_bytes((sweeps_folder() / "sac_y.yaml").read_bytes())
     assert compose(["sweep=sac_y"]).study.name == "sac_y"

@@ -1,4 +1,4 @@
-"""The services of the compose file on this machine, without an engine: what would be containers are processes."""
+"""The services of the compose file on this machine, without an engine: processes instead of containers."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from tests.docker.files import REPOSITORY, read_compose, read_image
 from tests.support.waiting import wait_until
 
 STOP_S, SECRETS = 20.0, "/run/secrets"
-# What the commands call beside Python's own programs; git, for one, is not in the image.
+# Programs that the commands call beside Python's own; git, for one, is not in the image.
 IN_THE_IMAGE = ("sh", "cat")
 
 
 class Containers:
-    """The services, each with the words and the environment that the files give it.
+    """The services, each with the command and the environment that the files give it.
 
-    Only what is an engine's is put in its place: names of services are 127.0.0.1, their ports are free ones, and
-    volumes, secrets and the image's own folders are folders here.
+    Only what an engine would provide is replaced: names of services by 127.0.0.1, their ports by free ones, and
+    volumes, secrets and the image's own folders by folders here.
 
     Args:
         folder: Empty folder for its files.
@@ -53,7 +53,7 @@ class Containers:
         self._pattern = re.compile("|".join(f"(?P<_{place}>{pattern})" for place, pattern in enumerate(self._replaced)))
 
     def _addresses(self) -> dict[str, str]:
-        """Return the addresses in the files, as patterns, and what they are here."""
+        """Return patterns of the addresses in the files, with their replacements here."""
         replaced = {r"\b0\.0\.0\.0\b": "127.0.0.1"}
         for name, service in self.services.items():
             for port in service.get("ports", []):
@@ -63,7 +63,7 @@ class Containers:
         return replaced
 
     def _paths(self) -> dict[str, str]:
-        """Return the paths in the files, as patterns, and what they are here."""
+        """Return patterns of the paths in the files, with their replacements here."""
         replaced = {rf"{SECRETS}\b": str(self.secret.parent)}
         replaced |= {re.escape(path): str(here) for path, here in self._image.copied.items()}
         for name in self.services:
@@ -71,7 +71,7 @@ class Containers:
         return replaced
 
     def volumes(self, name: str) -> list[tuple[Path, str, list[str]]]:
-        """Return the volumes of a service, each with its folder here, its place in the container and its options."""
+        """Return the volumes of a service, each with its folder here, its path in the container and its options."""
         split = [volume.split(":") for volume in self.services[name].get("volumes", [])]
         named = [(self.folder / source, target, options) for source, target, *options in split if source[0] != "."]
         for folder, _, _ in named:
@@ -79,11 +79,11 @@ class Containers:
         return named
 
     def here(self, text: str) -> str:
-        """Return a text of the files as it has to be on this machine."""
+        """Return a text of the files with the addresses and paths of this machine."""
         return self._pattern.sub(lambda found: list(self._replaced.values())[int(str(found.lastgroup)[1:])], text)
 
     def environment(self, name: str) -> dict[str, str]:
-        """Return the variables that a service's processes have, and no others."""
+        """Return the whole environment of a service's processes."""
         path = [Path(sys.executable).parent, self.folder / "programs"]
         own = {"HOME": str(self.folder / "home"), "LANG": "C.UTF-8", "PYTHONPATH": str(REPOSITORY)}
         given = self._image.environment | self.services[name].get("environment", {})
@@ -104,12 +104,12 @@ class Containers:
         """Start a service."""
         command = self._command(name, [*self._image.entrypoint, *shlex.split(self.services[name]["command"])])
         with self._log_of(name).open("ab") as log:
-            # In a session of its own: a Ctrl-C is meant for who started it.
+            # In its own session: a Ctrl-C is meant for the parent process.
             self._processes[name] = subprocess.Popen(command, **self._surroundings(name, log), start_new_session=True)
         return self._processes[name]
 
     def wait_until_healthy(self, name: str) -> None:
-        """Wait until the health check of a service says that it is there."""
+        """Wait until the health check of a service passes."""
         wait_until(
             lambda: self.is_healthy(name),
             process=self._processes.get(name),
@@ -118,7 +118,7 @@ class Containers:
         )
 
     def stop(self, name: str) -> int:
-        """Stop a service as an engine does, which waits for as long as the file says; return its exit code."""
+        """Stop a service as an engine does, within the grace period of the file; return its exit code."""
         process = self._processes.pop(name)
         self._terminate(process)
         grace = self.services[name].get("stop_grace_period", "10s")
@@ -165,7 +165,7 @@ class Containers:
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """End what is left of the group of a process."""
+    """Kill what is left of a process's group."""
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)
     process.wait()

@@ -14,7 +14,7 @@ import yaml
 REPOSITORY = Path(__file__).parents[2]
 FOLDER = REPOSITORY / "docker"
 COMPOSE, CUDA, WORKERS = FOLDER / "compose.yaml", FOLDER / "compose.cuda.yaml", FOLDER / "kubernetes" / "workers.yaml"
-# Those forms that are used here: ${NAME:-default}, also where it is given empty, and ${NAME-default}.
+# The forms in use: ${NAME:-default}, whose default also replaces an empty value, and ${NAME-default}.
 VARIABLE = re.compile(r"\$\{(?P<name>\w+)(?P<kind>:?-)(?P<default>[^}$]*)\}")
 
 
@@ -56,7 +56,7 @@ class Image:
     Args:
         environment: Environment variables.
         copied: Files of the repository by their paths in the image.
-        words: Words of the instructions of which the last one counts, such as `USER`.
+        words: Words of the instructions whose last occurrence counts, such as `USER`.
     """
 
     environment: dict[str, str] = field(default_factory=dict)
@@ -70,7 +70,7 @@ class Image:
 
     @property
     def healthcheck(self) -> list[str]:
-        """The command that looks after a container."""
+        """The command that checks the health of a container."""
         return list(json.loads(self.words["HEALTHCHECK"].partition(" CMD ")[2]))
 
 

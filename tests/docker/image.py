@@ -21,7 +21,7 @@ from tests.support.requirements import unavailable
 
 PROGRAMS = ("buildah", "debootstrap")
 USER_ID = 1000
-# Debian's own Python stands for that of the official image, of the same version.
+# Debian's own Python stands in for the official image's, which has the same version.
 BASE = """FROM scratch
 COPY base /
 RUN ln -s /usr/bin/python3 /usr/local/bin/python
@@ -30,7 +30,7 @@ IN_A_CHROOT = ("--isolation", "chroot")
 
 
 class Buildah:
-    """Images and containers in a folder of their own.
+    """Images and containers in their own folder.
 
     Args:
         folder: Empty folder for all of them.
@@ -73,7 +73,7 @@ def built_image() -> Iterator[Buildah]:
 
 
 def pip_sources(config: Path) -> list[str]:
-    """Return the words that let pip find packages in a container where it finds them on this machine.
+    """Return options of a build that let pip find packages where it finds them on this machine.
 
     Args:
         config: File to write pip's configuration to.

@@ -1,4 +1,4 @@
-"""The compose files: by the Compose Specification's own schema, and by what is expected of ours."""
+"""The compose files, checked by the Compose Specification's own schema, and by what is expected of ours."""
 
 import json
 import re
@@ -63,7 +63,7 @@ def test_each_is_started_when_those_that_it_needs_answer(compose):
 
 def test_workers_can_be_many(compose):
     worker = compose["services"]["worker"]
-    # A name, a host name or a port of its own could be had by one alone; by their host names workers know each other.
+    # Only one worker could have a given name, host name or port; by their host names workers know each other.
     assert {"container_name", "hostname", "network_mode", "ports"} & worker.keys() == set()
     assert "study.workers=1" in worker["command"].split()
     assert int(worker["stop_grace_period"].removesuffix("s")) >= 15
@@ -74,7 +74,7 @@ def test_volumes_have_names_and_so_survive(compose):
     sources = {volume.partition(":")[0] for volume in mounted}
     assert {source for source in sources if not source.startswith("./")} == set(compose["volumes"])
     assert {source for source in sources if source.startswith("./")} == {"./databases.sql"}
-    # What the image's user writes to is the user's in the image, and so in a fresh volume.
+    # The image's user owns the folders that it writes to in the image, and so in a fresh volume.
     targets = {volume.split(":")[1] for volume in mounted if volume.count(":") == 1}
     theirs = {"/var/lib/postgresql/data"}
     assert targets - theirs == set(re.findall(r"(?<= )/\w+", read_image().words["RUN"]))

@@ -11,7 +11,7 @@ from tests.docker.files import FOLDER, REPOSITORY, instructions, read_image
 
 
 def test_hadolint_finds_nothing_and_ignores_nothing():
-    # Of the test extra.
+    # Installed with the test extra.
     program = Path(sys.executable).with_name("hadolint")
     words = [program, "--disable-ignore-pragma", "--failure-threshold", "style", FOLDER / "Dockerfile"]
     linted = subprocess.run(words, cwd=FOLDER, capture_output=True, text=True, check=False)
@@ -22,7 +22,7 @@ def test_image_is_slim_pinned_and_nobodys_root():
     bases = {words.split()[0] for name, words in instructions() if name == "FROM"}
     assert bases == {"python:3.11-slim-bookworm"}
     image = read_image()
-    # A number: Kubernetes cannot tell of a name that it is not root.
+    # A number: Kubernetes cannot tell whether a name is root.
     user, group = image.words["USER"].split(":")
     assert int(user) > 0 < int(group)
     assert f"--uid {user} " in image.words["RUN"]

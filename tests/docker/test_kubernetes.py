@@ -1,4 +1,4 @@
-"""The manifest for workers in Kubernetes: by the schemas of its API, and by what is expected of ours."""
+"""The manifest for workers in Kubernetes, checked by the schemas of its API, and by what is expected of ours."""
 
 import kubernetes_validate
 import pytest
@@ -6,7 +6,7 @@ import yaml
 
 from tests.docker.files import WORKERS, read_compose, read_image
 
-# The first whose indexed Jobs count failures by index without being asked to, and the newest whose schemas are there.
+# The first whose indexed Jobs count failures by index without a feature gate, and the newest with schemas.
 VERSIONS = ("1.33", "1.37")
 
 
@@ -41,12 +41,12 @@ def test_job_is_indexed_and_repeats_only_what_may_help(job):
     assert job["backoffLimitPerIndex"] > 0
     taken_away, ended = job["podFailurePolicy"]["rules"]
     assert taken_away == {"action": "Ignore", "onPodConditions": [{"type": "DisruptionTarget", "status": "True"}]}
-    # 0 is the end of the study, 2 may be a server that is unavailable, 130 a worker that was told to leave.
+    # 0 is the end of the study, 2 and 75 may be a server that is unavailable, 130 a worker that was told to leave.
     assert (ended["action"], ended["onExitCodes"]) == ("FailIndex", {"operator": "In", "values": [1]})
 
 
 def test_pod_is_nobodys_root_and_fits_the_image(pod):
-    # Which counting failures by index needs.
+    # Required for counting failures by index.
     assert pod["restartPolicy"] == "Never"
     assert {"hostNetwork", "hostname"} & pod.keys() == set()
     user, group = map(int, read_image().words["USER"].split(":"))
@@ -62,7 +62,7 @@ def test_pod_is_nobodys_root_and_fits_the_image(pod):
 
 def test_pod_runs_what_a_worker_of_the_compose_file_runs(pod):
     (container,) = pod["containers"]
-    # The image's entry point stays.
+    # The image's entry point is kept.
     assert "command" not in container
     worker = read_compose()["services"]["worker"]
     assert container["args"] == worker["command"].split()

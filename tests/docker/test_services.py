@@ -1,4 +1,4 @@
-"""Every service's command, as the compose file has it, run on this machine beside its health check."""
+"""Every service's command from the compose file, run on this machine with its health check."""
 
 import json
 import os
@@ -22,7 +22,7 @@ from tests.support.postgres import PASSWORD, postgres_server
 from tests.support.waiting import HANG_S, wait_until
 
 SECRET = f"{SECRETS}/database_password"
-# Trials that only wait, between one and five seconds, and of which only one key is searched.
+# Trials that only wait, between one and five seconds, with only one searched key.
 TRIALS = (
     "study.task._target_=benchmarks.sweeps.sleeping.Sleeping study/pruner=none "
     "study.n_trials=2 study.final_eval.top_k=0 "
@@ -33,13 +33,13 @@ TRAININGS = (
     "study/pruner=none study.n_trials=2 study.final_eval.top_k=0 training.env_steps=3000 "
     "training.validation_episodes=2 data.n_training=1 data.n_validation=1 data.n_test=1 evaluation.episodes=2"
 )
-# A worker's database connections, beside which others have a place: see POSTGRES_CONNECTIONS.
+# Database connections of a worker, which leave room for others: see POSTGRES_CONNECTIONS.
 MAX_CONNECTIONS = 6
 
 
 @pytest.fixture
 def postgres_there(postgres_programs):
-    """Yield a server of this test's own."""
+    """Yield a server for this test alone."""
     with postgres_server() as server:
         yield server
 
@@ -53,7 +53,7 @@ def image():
 
 @pytest.fixture(params=["processes", pytest.param("image", marks=pytest.mark.slow)])
 def containers(request, postgres_programs, postgres_there, tmp_path):
-    """Yield the services on this machine; of them PostgreSQL is there, as its image leaves it at its first start."""
+    """Yield the services on this machine; PostgreSQL is running, as its image leaves it at its first start."""
     given = (tmp_path, postgres_there.port, postgres_programs, PASSWORD)
     if request.param == "image":
         services = ImageContainers(request.getfixturevalue("image"), *given, ARMSCAN_WORDS=TRAININGS)
@@ -77,7 +77,7 @@ def asked(url, **headers):
 
 
 def command_lines(marked):
-    """Return the words of all processes that have this in their environment."""
+    """Return the command lines of all processes that have this in their environment."""
     found = []
     for process in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
@@ -87,18 +87,18 @@ def command_lines(marked):
 
 
 def selected(server, query):
-    """Return the first column of what the studies' database answers."""
+    """Return the first column of a query's result in the studies' database."""
     with psycopg.connect(server.uri("armscan")) as connection:
         return [row[0] for row in connection.execute(query)]
 
 
 def states(server):
-    """Return how the trials stand."""
+    """Return the states of the trials."""
     return selected(server, "SELECT state::text FROM trials ORDER BY number")
 
 
 def n_connections(server):
-    """Return how many clients the studies' database has, this one left out."""
+    """Return the number of clients of the studies' database, except this one."""
     (n_all,) = selected(server, "SELECT count(*) FROM pg_stat_activity WHERE datname = 'armscan'")
     return n_all - 1
 
@@ -107,7 +107,7 @@ def n_connections(server):
 def test_postgres_understands_its_words_and_says_when_it_is_unavailable(containers, postgres_there, postgres_programs):
     words = shlex.split(containers.services["postgres"]["command"])
     (data,) = selected(postgres_there, "SHOW data_directory")
-    # What it would have with these words, said without a start.
+    # The value that these arguments would give, printed without a start.
     asking = [postgres_programs / words[0], "-C", "max_connections", *words[1:], "-D", data]
     said = subprocess.run(asking, capture_output=True, text=True, check=True)
     assert int(said.stdout) >= 300
@@ -123,7 +123,7 @@ def test_study_on_the_services_is_stopped_and_gone_on_with(containers, postgres_
     for name in ("mlflow", "dashboard"):
         containers.wait_until_healthy(name)
     mlflow, dashboard = (f"http://127.0.0.1:{containers.ports[name]}" for name in ("mlflow", "dashboard"))
-    # As others here call it, as a browser does, and as a page of somebody else's would.
+    # By the name that other services use, as a browser does, and as a foreign page would.
     asked_for = {"mlflow": f"{mlflow}/ajax-api/2.0/mlflow/experiments/search?max_results=1"}
     asked_for["dashboard"] = f"{dashboard}/api/studies"
     for name, url in asked_for.items():
@@ -134,7 +134,7 @@ def test_study_on_the_services_is_stopped_and_gone_on_with(containers, postgres_
     assert not containers.is_healthy("worker")
     containers.start("worker")
     containers.wait_until_healthy("worker")
-    # Until the trial knows its tracked run, with which it is gone on.
+    # Until the trial knows its tracked run, which is then resumed.
     wait_until(lambda: "mlflow_run" in selected(postgres_there, "SELECT key FROM trial_user_attributes"))
     assert states(postgres_there) == ["RUNNING"]
     assert n_connections(postgres_there) - n_before <= MAX_CONNECTIONS
@@ -152,7 +152,7 @@ def test_study_on_the_services_is_stopped_and_gone_on_with(containers, postgres_
     client = MlflowClient(mlflow)
     (experiment,) = (each for each in client.search_experiments() if each.name == "armscan")
     runs = client.search_runs([experiment.experiment_id])
-    # The study's and its trials'; trainings also have those of the baselines.
+    # The runs of the study and its trials; trainings also have runs of the baselines.
     assert len(runs) >= 3
     assert {run.info.status for run in runs} == {"FINISHED"}
     client.log_text(runs[0].info.run_id, "kept", "note.txt")

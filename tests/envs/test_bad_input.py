@@ -1,4 +1,4 @@
-"""Wrong arguments, actions and options: taken where right after all, else refused by the project's own errors."""
+"""Arbitrary arguments, actions and options: accepted if valid, otherwise refused by the project's own errors."""
 
 import pickle
 from dataclasses import fields
@@ -53,7 +53,7 @@ WRAPPER_RULES = ["stack", "stack_exclude", "memory", "stack_memory"]
 
 
 def works(env):
-    """Return whether an environment that could be made works, or says in its own words why it cannot."""
+    """Return whether an environment works, or refuses with one of armscan's own errors; True if there is none."""
     if env is None:
         return True
     contains = env.observation_space.contains
@@ -168,7 +168,7 @@ def test_reset_options_of_junk(wrist, value):
 def test_reset_seeds_of_junk(wrist, value):
     for env, seed in ((ArmscanEnv([wrist]), value), (ArmscanVectorEnv(1, [wrist]), [value])):
         assert is_answered(lambda env=env, seed=seed: env.reset(seed=seed))
-        # Taken or refused, the environment goes on.
+        # Accepted or refused, the environment still works.
         assert env.observation_space.contains(env.reset(seed=1)[0])
     assert is_answered(lambda: ArmscanVectorEnv(2, [wrist]).reset(seed=value))
 
@@ -255,7 +255,7 @@ def test_a_volume_of_one_voxels_thickness_is_played_on(axis, observation):
 
 
 def test_volumes_that_were_pickled_play_beside_others(wrist):
-    """Compiled code takes arrays that cannot be written to for others than those that can."""
+    """To Numba, read-only arrays have another type than writable ones."""
     copy = pickle.loads(pickle.dumps(wrist))
     assert not copy.labels.flags.writeable
     assert copy.labels_yxz.flags.c_contiguous

@@ -1,4 +1,4 @@
-"""The environment as strangers use it: Gymnasium's checker, its registry and wrappers, another training library."""
+"""The environment as others use it: Gymnasium's checker, its registry and wrappers, another training library."""
 
 import gc
 import itertools
@@ -36,7 +36,7 @@ PROJECTIONS = ["x", "y", "xy", "zy", "full", ["rz", "tx"]]
 STACKS = {"one": {}, "stack": {"stack": 3}}
 MEMORIES = {"none": {}, "memory": {"memory": 2}, "memory_first": {"memory": 2, "stack_memory": True}}
 FORMS = {"flat": {"flat": True}, "dict": {"flat": False}, "dict_part": {"flat": False, "stack_exclude": ["action"]}}
-# Some of them, where not every combination is needed.
+# A few combinations, for tests that do not need all of them.
 MIXED = {
     "vector": {},
     "remembering": {"projection": "zy", "stack": 3, "memory": 2, "stack_memory": True},
@@ -54,7 +54,7 @@ MIXED = {
 
 
 class Presented(gym.Env):
-    """Presents an environment and its wrappers as a bare one: Gymnasium's checker wants none that is wrapped."""
+    """Presents an environment and its wrappers as a bare one, because Gymnasium's checker warns of wrappers."""
 
     def __init__(self, env):
         self.env = env
@@ -80,7 +80,7 @@ class Presented(gym.Env):
 
 @pytest.fixture(scope="module")
 def nothing_left_open():
-    """Collect what tests of other modules have left open, whose warnings would be raised in the middle of these."""
+    """Collect what tests of other modules have left open, whose warnings would otherwise be raised during these."""
     gc.collect()
 
 
@@ -93,7 +93,7 @@ def no_warnings(nothing_left_open):
 
 
 def play(env, n_steps=4):
-    """All that some steps show."""
+    """Return everything that a few steps return."""
     env.action_space.seed(3)
     shown = [env.reset(seed=3)]
     for _ in range(n_steps):
@@ -123,7 +123,7 @@ def test_every_pair_of_choices_is_covered(first, second):
 @pytest.mark.parametrize(("observation", "projection", "layout", "memory"), COVERING, ids=str)
 @pytest.mark.parametrize("env_id", ENV_IDS)
 def test_env_conforms(wrist, env_id, observation, projection, layout, memory):
-    """The checker has nothing to say; pickled, or made again from its spec, it plays the same episodes."""
+    """The checker finds nothing; pickled, or made again from its spec, the environment plays the same episodes."""
     form, stack = layout
     rules = {"observation": OBSERVATIONS[observation], "projection": projection, "max_steps": 3}
     env = gym.make(env_id, volumes=[wrist], **rules, **FORMS[form], **STACKS[stack], **MEMORIES[memory])
@@ -158,7 +158,7 @@ def test_env_is_flat_by_itself_where_every_part_is_a_vector(wrist, variant, kind
 
 
 def test_spec_round_trip_through_text(data_folder):
-    """A spec is text where its arguments are: a folder rather than volumes, names rather than objects."""
+    """A spec can be text if its arguments can: a folder rather than volumes, names rather than objects."""
     rules = {"observation": ["cluster", "slice"], "stack": 2, "stack_exclude": ["action"], "memory": 1, "max_steps": 3}
     env = gym.make(armscan.ENV_ID, volumes=str(data_folder), **rules)
     spec = gym.envs.registration.EnvSpec.from_json(env.spec.to_json())
@@ -195,7 +195,7 @@ def test_gymnasiums_wrappers_work_on_it(wrist, variant):
             rewards.append(reward)
             is_over = terminated or truncated
         assert len(rewards) <= 2
-        # `TimeLimit` says so of its last step, also where that has ended the episode.
+        # `TimeLimit` truncates at its last step, even if that step has ended the episode.
         assert truncated == (len(rewards) == 2)
         assert info["episode"]["l"] == len(rewards)
         assert info["episode"]["r"] == pytest.approx(sum(rewards))
@@ -204,7 +204,7 @@ def test_gymnasiums_wrappers_work_on_it(wrist, variant):
 @pytest.mark.parametrize("variant", ["remembering", "images"])
 def test_gymnasium_records_a_video_of_it(wrist, variant, tmp_path):
     with warnings.catch_warnings():
-        # Writing a video is MoviePy's own matter.
+        # Warnings of MoviePy, which writes the video, are not ours.
         warnings.filterwarnings("default", module="moviepy")
         env = RecordVideo(make_mixed(wrist, variant, render_mode="rgb_array"), str(tmp_path / "video"), lambda _: True)
         env.reset(seed=0)
@@ -218,7 +218,7 @@ def test_gymnasium_records_a_video_of_it(wrist, variant, tmp_path):
 @pytest.mark.parametrize("variant", ["vector", "remembering", "image", "on_budget", "on_stop"])
 @pytest.mark.parametrize("env_id", ENV_IDS)
 def test_vector_env_conforms(wrist, env_id, variant):
-    """Its spaces and shapes; that it gives what single environments give is tested beside it."""
+    """Spaces and shapes; test_vector_env.py compares the results with those of single environments."""
     arguments = {"volumes": [wrist], "max_steps": 3} | MIXED[variant]
     envs, single = gym.make_vec(env_id, num_envs=2, **arguments), gym.make(env_id, **arguments)
     assert envs.single_observation_space == single.observation_space
@@ -242,9 +242,9 @@ def test_vector_env_conforms(wrist, env_id, variant):
 
 @pytest.fixture
 def learn():
-    """Train with Stable-Baselines3 and say what its policy has learned."""
+    """Yield a function that trains with Stable-Baselines3, checks that weights have changed, and returns the model."""
     with warnings.catch_warnings():
-        # What it says of its own defaults, such as how large its convolutions want an image, is not ours.
+        # Warnings about its own defaults, such as the image size that its convolutions expect, are not ours.
         warnings.simplefilter("ignore")
         import stable_baselines3 as baselines
         from stable_baselines3.common.env_checker import check_env as check_for_baselines

@@ -34,7 +34,7 @@ def test_env_reads_the_volumes_of_a_folder(data_folder):
 
 
 def play(env, seed, n_steps=30):
-    """Everything that an episode or two show, drawn from the environment's own generator."""
+    """Return everything that an episode or two show, with actions from the environment's own generator."""
     env.action_space.seed(seed)
     observed, info = env.reset(seed=seed)
     trace = [observed.tolist(), info["volume"], info["translation_mm"].tolist()]
@@ -115,7 +115,7 @@ def test_env_on_stop_ends_with_the_plane_at_which_the_agent_stops(phantom):
 
 @pytest.mark.parametrize("start", ["middle", "random"])
 def test_env_shows_the_same_however_an_episode_ends(phantom, start):
-    """Rewards and observations are the same; the action's last component stands beside the others."""
+    """Rewards and observations are the same; only the action may have one more component."""
     rules = {"projection": "zy", "observation": "slice_channels", "start": start}
     shown = {}
     for ends in ("on_reward", "on_budget", "on_stop"):
@@ -277,7 +277,7 @@ def test_transform_about_the_first_voxel_can_be_chosen(phantom):
 
 
 def test_env_takes_volumes_of_different_spacing_by_metric_clustering(dataset):
-    """The same arm in its own and in finer pixels: the same plane shows the same tissues and earns the same."""
+    """The same arm in its own pixels and in finer ones: the same plane shows the same tissues for the same reward."""
     volume = list(dataset.values())[1]
     s_x, s_y, s_z = volume.spacing
     finer = LabelVolume(volume.labels.repeat(2, axis=0), (s_x / 2, s_y, s_z), "finer", volume.optimal_action)
@@ -363,7 +363,7 @@ def test_env_clusters_by_millimetres(wrist, clustering):
 
 
 class Broken:
-    """A user's own reward that gives what no reward may be."""
+    """A user's own reward that returns what no reward may be."""
 
     def __init__(self, given):
         self.given = given

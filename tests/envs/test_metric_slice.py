@@ -25,7 +25,7 @@ def observed(slice_xz, slice_pixel_mm, **arguments):
 
 
 def reference(slice_xz, pixel_mm, field_mm, image_pixel_mm):
-    """Compute the image slowly: by the area that each pixel of the slice has in common with each pixel of the image."""
+    """Compute the image slowly: by the overlap of each pixel of the slice with each pixel of the image."""
     shape = [round(field / pixel) for field, pixel in zip(field_mm, image_pixel_mm, strict=True)]
     weights = []
     for axis in (0, 1):

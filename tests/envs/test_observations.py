@@ -157,7 +157,7 @@ def test_env_takes_a_users_own_observation(wrist, observation):
 
 
 class Careless:
-    """A user's own observation that gives other parts than it said."""
+    """A user's own observation that returns other parts than its spaces have."""
 
     def __init__(self, parts):
         self.parts = parts

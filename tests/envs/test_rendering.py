@@ -92,7 +92,7 @@ def test_render_outlines_clusters_alone():
     assert view.clusters.counts == (2, 1, 0)
     picture = np.asarray(slice_panel(view, (600, 300)))
     assert picture.shape == (300, 600, 3)
-    # Ten pixels a voxel, depth going up.
+    # Ten pixels per voxel, depth upward.
     voxels = picture[::-1].reshape(30, 10, 60, 10, 3)
     for (across, depth), ink in (
         ((6, 6), shaded(1, SHADES[0])),

@@ -9,7 +9,7 @@ from armscan.anatomy import PIXEL_TISSUES
 from armscan.envs import ArmscanEnv, SliceChannelsObservation, SliceGeometry, SliceObservation, View
 from armscan.errors import InvalidValueError
 
-# Where several labels meet in a reduced pixel, the first of these that is among them is shown.
+# If several labels fall into a reduced pixel, it shows the first of these that is among them.
 RAREST_FIRST = (3, 4, 2, 1, 0)
 KINDS = {SliceObservation: "slice", SliceChannelsObservation: "channels"}
 
@@ -38,7 +38,7 @@ def observed(kind, slice_xz, smallest=None, **arguments):
 
 
 def pixels_of(pixel, n, wanted):
-    """Return which of n pixels the given one of `wanted` stands for."""
+    """Return which of n pixels fall into a pixel, given by its index among `wanted` ones."""
     return [i for i in range(n) if i + 1 > pixel * n / wanted and i < (pixel + 1) * n / wanted]
 
 

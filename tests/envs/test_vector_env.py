@@ -51,7 +51,7 @@ def volumes(dataset):
 
 @pytest.mark.parametrize("variant", VARIANTS, ids=str)
 def test_vector_env_gives_bit_for_bit_what_single_environments_give(volumes, variant):
-    """Gymnasium's own vector environment of single ones is the measure: same seeds, same actions, several episodes."""
+    """The reference is Gymnasium's own vector environment of single ones: same seeds and actions, several episodes."""
     arguments = {"volumes": volumes, "max_steps": 4} | variant
     ours = gym.make_vec(armscan.ENV_ID, num_envs=3, **arguments)
     theirs = SyncVectorEnv([lambda: gym.make(armscan.ENV_ID, **arguments)] * 3)
@@ -95,7 +95,7 @@ def test_vector_env_takes_a_volume_for_all(dataset):
 
 @pytest.mark.parametrize("variant", VARIANTS, ids=str)
 def test_vector_env_takes_steps_in_some_environments_only(volumes, variant):
-    """Each environment goes its own way, and gives what it gives alone."""
+    """Each environment steps at its own pace, and gives what it gives alone."""
     arguments = {"volumes": volumes, "max_steps": 4} | variant
     together = gym.make_vec(armscan.ENV_ID, num_envs=4, autoreset_mode="Disabled", **arguments)
     alone = [gym.make(armscan.ENV_ID, **arguments) for _ in range(4)]

@@ -1,4 +1,4 @@
-"""The window that shows an episode as it goes on."""
+"""The window that shows an episode while it is played."""
 
 import subprocess
 import sys
@@ -20,7 +20,7 @@ PICTURE = np.arange(60 * 80 * 3, dtype=np.uint8).reshape(60, 80, 3)
 
 @pytest.fixture
 def seen(phantom, unseen_windows):
-    """Yield an environment that is shown, its window quicker than it is for people."""
+    """Yield an environment that is shown in a window, without pauses between frames."""
     env = gymnasium.make(armscan.ENV_ID, volumes=[phantom], projection="zy", render_mode="human")
     env.unwrapped._window._interval_s = 0.0
     yield env

@@ -38,7 +38,7 @@ def test_stack_gives_what_gymnasiums_own_gives(phantom, observation):
 
 
 class Scripted(gym.Env):
-    """Gives the rewards it is told."""
+    """An environment that gives the rewards it is told."""
 
     observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
     action_space = gym.spaces.Box(-1, 1, (1,), np.float32)

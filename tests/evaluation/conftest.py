@@ -12,7 +12,7 @@ from armscan.volumes.resampling import resample
 
 @pytest.fixture(autouse=True)
 def tracking_database(database):
-    """Spare each test the making of MLflow's tables."""
+    """Give each test a database that has MLflow's tables already."""
 
 
 @pytest.fixture

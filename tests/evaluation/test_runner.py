@@ -1,4 +1,4 @@
-"""Evaluations of real tracked runs, as a person types them, on volumes that an agent can and cannot be applied to."""
+"""Evaluations of real tracked runs, as a user types them, on volumes that an agent can and cannot be applied to."""
 
 import json
 import subprocess

@@ -1,4 +1,4 @@
-"""`armscan evaluate --video`, as a person types it, on real tracked runs."""
+"""`armscan evaluate --video`, as a user types it, on real tracked runs."""
 
 import json
 import re
@@ -14,7 +14,6 @@ from tests.support.tracked_runs import GUESSER, ON_FILES, store_of, tracked
 
 EPISODE = re.compile(r"^(.+): (\S+), seed (\d+): (no )?success after (\d+) steps?, ([\d.]+) mm", re.MULTILINE)
 GUESSER_OF_ANYTHING = ["--agent=sac", "~agent.network", "agent._target_=tests.support.tracked_runs.GuesserOfAnything"]
-PICTURES_A_FRAME, PICTURES_OF_THE_LAST = 6, 24
 
 
 @pytest.fixture
@@ -40,7 +39,7 @@ def mp4_frames(file):
 
 
 def difference(one, other):
-    """Mean of what two pictures differ by, from 0 to 255."""
+    """Return the mean absolute difference of two pictures, from 0 to 255."""
     return np.asarray(ImageChops.difference(one, other)).mean()
 
 
@@ -67,7 +66,7 @@ def test_video_is_of_the_episodes_of_an_evaluation_frame_by_frame_in_both_files(
     facts, pictures = mp4_frames(tmp_path / f"{name}.mp4")
     assert (facts["codec"], facts["pix_fmt"].partition("(")[0], facts["size"]) == ("h264", "yuv420p", (860, 512))
     assert len(pictures) == sum(ms // 100 for ms in durations)
-    # Each picture of the one is in the other, where it belongs; those of other steps differ by more.
+    # Each frame of the GIF is in the MP4 at its time; frames of other steps differ by more.
     at = 0
     for ms, frame in frames:
         same = Image.fromarray(pictures[at + ms // 200])

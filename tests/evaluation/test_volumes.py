@@ -10,7 +10,7 @@ from tests.support.tracked_runs import GUESSER, ON_FILES, tracked, written
 
 
 def swapped(manifest):
-    """Training and test volumes, exchanged."""
+    """Return a manifest with training and test volumes exchanged."""
     splits = manifest["splits"]
     return manifest | {"splits": splits | {"train": splits["test"], "test": splits["train"]}}
 
@@ -66,7 +66,7 @@ def test_volumes_of_the_training_are_known_under_other_names_and_others_under_th
     one, _, third, last = manifest["volumes"]
     copies = tmp_path / "copies"
     copies.mkdir()
-    # One of the training under another name, and one of the test under that of the validation.
+    # A training volume under another name, and a test volume under the name of a validation volume.
     for name, copy in {one: "copy.nii.gz", last: third}.items():
         shutil.copy(wrists / name, copies / copy)
     entries = {"copy.nii.gz": manifest["volumes"][one], third: manifest["volumes"][last]}

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from armscan.config.compose import compose
@@ -15,20 +16,20 @@ def split_of_sizes(volume):
     """Return a split whose test volume is narrower than the others."""
     return Split(
         {"a": replace(volume, name="a")},
-        {"b": replace(volume, name="b")},
+        {"b": replace(volume, name="b", labels=np.roll(volume.labels, 1, axis=2))},
         {"c": replace(volume, name="c", labels=volume.labels[:-24])},
     )
 
 
 class AsLargeAsTheSlice(SliceObservation):
-    """One's own, without a crop that could be the same everywhere."""
+    """A user's own observation, without a crop that could be the same everywhere."""
 
     def __init__(self):
         super().__init__()
 
 
 def config_of_sizes(phantom, monkeypatch, *overrides):
-    """Return the configuration with volumes of which that of the test is narrower."""
+    """Return the configuration with volumes of which the test volume is narrower."""
     monkeypatch.setattr("armscan.training.phantom_data", lambda **_: split_of_sizes(phantom))
     return compose(overrides)
 
@@ -60,7 +61,7 @@ def test_stage_refuses_volumes_that_an_observation_is_of_another_shape_on(phanto
 
 
 class Unfinished:
-    """An algorithm of one's own, and its agent, which learns but gives no policy."""
+    """A user's own algorithm and agent, which learns but has no policy."""
 
     def agent(self, setup):
         return self

@@ -23,7 +23,7 @@ def disk(tmp_path):
 
 
 def run_until_full(disk, *words, cwd):
-    """Run the command, fill the disk after its first epoch; return its exit code and what it has printed."""
+    """Run the command, fill the disk after its first epoch; return exit code, standard output and standard error."""
     printed, told = cwd / "printed", cwd / "told"
     with printed.open("w") as output, told.open("w") as errors:
         process = subprocess.Popen([sys.executable, *COMMAND, *words], cwd=cwd, stdout=output, stderr=errors)

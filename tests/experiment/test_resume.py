@@ -1,4 +1,4 @@
-"""Runs that are killed, at any moment, and go on: real processes, ended by the system's own kill -9."""
+"""Runs that are killed at any moment, and resumed: real processes, ended by `kill -9`."""
 
 import json
 import os
@@ -50,7 +50,7 @@ SLOWLY = ["-c", SLOWLY_WRITTEN]
 
 
 def killed(moment, *arguments, cwd, program=COMMAND):
-    """Start the command and kill it as soon as `moment` has come, given what it has printed."""
+    """Start the command, and kill it as soon as `moment` is true of what it has printed."""
     with (cwd / "printed").open("w") as printed:
         process = subprocess.Popen(
             [sys.executable, *program, *arguments], cwd=cwd, stdout=printed, stderr=subprocess.STDOUT
@@ -84,13 +84,13 @@ def named_tensors(tree, name=""):
 
 
 def figures(client, run):
-    """Return the history of every figure but the times, which no two runs share."""
+    """Return the history of every metric except times, which no two runs share."""
     names = [name for name in run.data.metrics if not name.startswith(TIMES)]
     return {name: [(p.step, p.value) for p in client.get_metric_history(run.info.run_id, name)] for name in names}
 
 
 def assert_ended_alike(cwd):
-    """Check that the two runs of a store have the same figures, none twice, and the same weights bit for bit."""
+    """Check that the two runs of a store have the same metrics, none twice, and the same weights bit for bit."""
     client, runs = runs_in(cwd)
     assert [run.info.status for run in runs] == ["FINISHED"] * 2
     first, second = (figures(client, run) for run in runs)
@@ -159,7 +159,7 @@ def test_run_killed_again_and_again_ends_as_if_it_had_not_been(tmp_path, argumen
 
 
 def moments(drawn):
-    """Twenty moments of one training, in the order in which it meets them, each in a process of its own."""
+    """Return twenty moments of one training, in the order in which it reaches them, each in its own process."""
     collecting, validating = "armscan.envs.vector_env:ArmscanVectorEnv.step", "armscan.training.episodes:step_each"
     updating = "armscan.agents.compiled_sac:CompiledSAC.update_repeatedly"
     soon = partial(drawn.uniform, 0.0, 0.01)
@@ -171,13 +171,13 @@ def moments(drawn):
         Moment(updating, drawn.randrange(6, 12), soon()),
         Moment(validating),
         Moment("armscan.training.episodes:_result", drawn.randrange(1, 3), soon()),
-        # While the first is written: before its contents, in the middle, behind them, before and after its name.
+        # While the first is written: before its contents, in the middle, after them, before and after its renaming.
         Moment("torch:save"),
         Moment("torch:save", 1, drawn.uniform(0.0, 0.003)),
         Moment("os:fsync", drawn.randrange(3, 5)),
         Moment("pathlib:Path.replace", 4),
         Moment("armscan.training.checkpoints:save_checkpoint", 1, 900.0),
-        # Resumed, the best is written again; then the next epoch's.
+        # After it is resumed, the best one is written again; then that of the next epoch.
         Moment("torch:save", 1, drawn.uniform(0.0, 0.003)),
         Moment("armscan.training.checkpoints:save_checkpoint", 2, 900.0),
         Moment(collecting, drawn.randrange(1, 13), soon()),
@@ -186,7 +186,7 @@ def moments(drawn):
         Moment("armscan.tracking.run:TrackedRun.on_epoch", 1, 900.0),
         Moment("mlflow:MlflowClient.log_batch", drawn.randrange(1, 4), 900.0),
         Moment(updating, drawn.randrange(1, 12)),
-        # When all is learned.
+        # After all learning.
         Moment("armscan.training.video:VideoRecorder.capture", 1, drawn.uniform(0.0, 0.05)),
         Moment("armscan.experiment.runner:keep_results", 1, drawn.uniform(0.0, 0.1)),
     ]
@@ -215,7 +215,7 @@ def test_interrupted_run_says_how_to_go_on_and_only_one_process_may(tmp_path):
         )
     wait_until(lambda: (tmp_path / "printed").read_text().count("/5000 steps") >= 2, process=process)
     (run,) = runs_in(tmp_path)[1]
-    # Still at work, and not done before the other has started.
+    # Still running, and not finished before the other has started.
     process.send_signal(signal.SIGSTOP)
     beside = armscan_run(f"resume={run.info.run_id}", cwd=tmp_path)
     assert beside.returncode == 2
@@ -263,7 +263,7 @@ def test_killed_job_of_a_multirun_is_resumed_by_its_own_id(tmp_path):
 
 @pytest.fixture
 def cut_off(tmp_path, database):
-    """Return a run that was cut off before anything was learned; return its client, id and folder."""
+    """Make a run that was cut off before anything was learned; return its client, ID and folder."""
     client, experiment_id = open_store(
         database, experiment="armscan", artifacts=str(tmp_path / "mlartifacts"), wait_s=60.0
     )
@@ -389,7 +389,7 @@ def test_resume_refuses_a_checkpoint_that_is_damaged_or_gone_and_leaves_the_run_
     last.unlink()
     assert f"{last}: this checkpoint is gone, but run" in refused(answer, f"resume={run.info.run_id}")
     assert client.get_run(run.info.run_id).info.status == "KILLED"
-    # A run that was killed when all but the closing was done; its figures stand already.
+    # A run that was killed when only closing was left: its metrics are logged already.
     last.write_bytes(contents)
     assert answer(f"resume={run.info.run_id}")[0] == 0
     assert client.get_run(run.info.run_id).info.status == "FINISHED"

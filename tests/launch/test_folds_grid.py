@@ -1,4 +1,4 @@
-"""Cross-validation: the words of its grid, and the table over all folds."""
+"""Cross-validation: the arguments of its grid, and the table over all folds."""
 
 import json
 from dataclasses import replace
@@ -61,8 +61,10 @@ def test_plan_of_what_is_no_grid_or_cannot_run_is_answered_in_one_line(words, li
     assert line in one_line_message(raised.value)
 
 
-def test_experiment_may_ask_for_folds(folder):
+@pytest.mark.parametrize("prefix", ["", "++"])
+def test_experiment_may_ask_for_folds(folder, prefix):
     words = ["experiment=few_wrists", f"data.path={folder}"]
+    assert with_folds([words[0], words[1], f"{prefix}data.folds=2"])[-1] == "data.fold=0,1"
     assert with_folds(words) == ["-m", *words, "data.fold=0,1"]
     assert with_folds([*words, "data.folds=null"]) == [*words, "data.folds=null"]
 
@@ -74,7 +76,7 @@ def test_experiment_may_ask_for_folds(folder):
         ["experiment=best_y"],
         ["data=nifti", "data.folds=2", "data.fold=1"],
         ["-m", "data=nifti", "data.path=x", "data.folds=2", "data.fold=0,1"],
-        # Hydra's own, which only shows something, and what Hydra refuses.
+        # Options of Hydra that only show something, and words that Hydra refuses.
         ["data=nifti", "data.folds=2", "--cfg=job"],
         ["data=phantom", "data.folds=2"],
         ["experiment=nothing"],
@@ -113,7 +115,7 @@ def test_table_puts_the_wrists_of_all_folds_together(tmp_path):
     assert figures.estimate("median_distance_mm").value == 4.5
     # Whatever the seed of a training, random planes are the same: they count once.
     assert (table.results["random, all folds"].n_seeds, table.results["random, all folds"].n_episodes) == (1, 2)
-    # The interval draws wrists: it is that of the same episodes in one evaluation.
+    # The interval resamples wrists: it is the same as for the same episodes in one evaluation.
     first = [json.loads((folder / "evaluation.json").read_text())[TEST] for folder, _ in runs[:2]]
     alone = Evaluation(tuple(each for one in first for each in Evaluation.of_dict(one).episodes))
     expected = MetricEstimates.of(alone).estimate("median_distance_mm")

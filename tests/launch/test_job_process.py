@@ -1,4 +1,4 @@
-"""Jobs of a multirun, each in a process of its own."""
+"""Jobs of a multirun, each in its own process."""
 
 import io
 import json
@@ -16,7 +16,7 @@ from armscan.launch import job_process
 
 @pytest.fixture
 def handlers():
-    """Put the handlers of signals back that a job sets in its process."""
+    """Restore the signal handlers that a job sets in its process."""
     before = {each: signal.getsignal(each) for each in job_process.ENDINGS}
     yield
     for each, handler in before.items():

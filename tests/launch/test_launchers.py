@@ -1,4 +1,4 @@
-"""Hydra's launchers for a cluster: what they are given, and what is said where they cannot be used."""
+"""Hydra's launchers for a cluster: their settings, and the error where they cannot be used."""
 
 import sys
 import warnings

@@ -1,4 +1,4 @@
-"""Policies as models: loaded where nothing of armscan is, served over HTTP, and refused where they answer otherwise."""
+"""Policies as models: loaded without armscan, served over HTTP, and refused if they differ from the agent."""
 
 import json
 import os
@@ -26,13 +26,13 @@ from tests.agents.test_plane_finder import made as made_finder
 from tests.agents.test_policy import observed, taught
 from tests.support.waiting import HANG_S, wait_until
 
-# They export seven policies and serve them.
+# They export seven policies and serve two of them.
 pytestmark = pytest.mark.full
 
 LOOPBACK = "127.0.0.1"
 FINDER = ("plane_finder", "looks")
 VARIANTS = [*((algorithm, made_of) for algorithm in ALGORITHMS for made_of in ENV_FACTORIES), FINDER]
-# Loads each model that it is given and asks it, for a batch of one and for all; what it has loaded is said at its end.
+# Loads each given model and asks it, for a batch of one and for all; prints which packages it has imported.
 ASK = """
 import sys, mlflow.pyfunc, numpy
 for folder in sys.argv[1:]:
@@ -60,7 +60,7 @@ def learner_of(algorithm, made_of, phantom):
 
 @pytest.fixture(scope="module")
 def made(phantom, tmp_path_factory):
-    """Return a model of every learner, observations, and how the learner acts on them, by what it is made of."""
+    """Return, for each variant of learner, the folder of its model, observations, and its actions on them."""
     everything = {}
     for algorithm, made_of in VARIANTS:
         folder = tmp_path_factory.mktemp(f"{algorithm}-{made_of}")
@@ -137,7 +137,7 @@ def serve(model):
     words = ["models", "serve", "-m", str(model), "--env-manager", "local", "-h", LOOPBACK, "-p", str(port)]
     bin_folder = Path(sys.executable).parent
     with log.open("wb") as said:
-        # It looks for uvicorn among the programs; in a group of its own, in which its own processes are ended, too.
+        # It looks for uvicorn on the path; in its own process group, so that its child processes are ended, too.
         server = subprocess.Popen(
             [bin_folder / "mlflow", *words],
             env=os.environ | {"PATH": f"{bin_folder}{os.pathsep}{os.environ['PATH']}"},
@@ -168,7 +168,7 @@ def invoke(port, given):
 
 
 class Otherwise:
-    """A learner whose policy is not what it acts by."""
+    """A learner whose actions differ from those of its policy."""
 
     def __init__(self, learner, shift):
         self._learner, self._shift = learner, shift
@@ -268,7 +268,7 @@ def test_run_keeps_its_policy_or_says_why_not_and_finishes(regression, tmp_path,
 
 def test_run_keeps_no_policy_where_its_configuration_says_so(regression, tmp_path):
     (tmp_path / "config.yaml").write_text("tracking: {policy: false}")
-    # Nothing is asked of the tracked run.
+    # The tracked run is not used.
     save_policy(*regression, None, tmp_path, print)
     assert [path.name for path in tmp_path.iterdir()] == ["config.yaml"]
 

@@ -1,4 +1,4 @@
-"""Real tracked runs of two agents with three seeds each, made once, and trainings that nobody has run."""
+"""Real tracked runs of two agents with three seeds each, made once, and invented trainings."""
 
 import sys
 from functools import partial
@@ -37,7 +37,7 @@ class Runs:
         return [each.info.run_id for each in self.all if each.data.tags["choice.agent"] == agent]
 
     def made(self, name="made", parent=None, **tags):
-        """Make a run of nothing but tags."""
+        """Make a run with nothing but tags; return its ID."""
         made = self.client.create_run(
             "1", run_name=name, tags=tags | ({"mlflow.parentRunId": parent} if parent else {})
         )
@@ -46,14 +46,14 @@ class Runs:
 
 @pytest.fixture(scope="session")
 def runs(tmp_path_factory):
-    """Six runs of armscan.run, as people make them; a test that changes one puts it back."""
+    """Six runs of armscan.run, as users make them; a test that changes one restores it."""
     folder = tmp_path_factory.mktemp("runs")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         for agent, words in AGENTS.items():
             for seed in range(3):
                 patch.setattr(sys, "argv", ["armscan.run", f"agent={agent}", f"seed={seed}", *words, *SMALL])
-                # The command sets it, and would take it for a person's wish the next time.
+                # The command sets it, and would take it for the user's setting the next time.
                 patch.setenv("HYDRA_FULL_ERROR", "0")
                 GlobalHydra.instance().clear()
                 assert run.main() == 0
@@ -69,7 +69,7 @@ def answer(armscan, runs, monkeypatch):
 
 @pytest.fixture
 def make_training():
-    """Make a training that nobody has run."""
+    """Invent a training."""
 
     def make(seed=0, *, params=None, choices=None, steps=(100, 200), values=(0.0, 1.0), mean_steps=3, **changes):
         series = Series(np.array(steps, float), np.array(steps, float) / 50, np.array(values, float))

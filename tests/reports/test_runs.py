@@ -1,4 +1,4 @@
-"""The report of runs, as a person makes it and opens it, on real tracked runs."""
+"""The report of runs, as a user makes and opens it, on real tracked runs."""
 
 import csv
 import json
@@ -23,7 +23,7 @@ def page(folder):
 
 @pytest.fixture
 def parent(runs):
-    """Yield the parent of all runs, as that of a multirun."""
+    """Yield a parent of all runs, as in a multirun."""
     parent = runs.made("multirun agent=sac,ppo seed=0,1,2")
     for each in runs.all:
         runs.client.set_tag(each.info.run_id, "mlflow.parentRunId", parent)
@@ -35,7 +35,7 @@ def parent(runs):
 
 @pytest.fixture
 def artifacts(runs):
-    """Yield the folder of a run's artifacts, which is put back afterwards."""
+    """Yield the folder of a run's artifacts, which is restored afterwards."""
     (run_id, *_) = runs.ids("sac")
     folder = runs.folder / "mlartifacts" / run_id / "artifacts"
     kept = runs.folder / "kept"

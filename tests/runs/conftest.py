@@ -28,7 +28,7 @@ def store(tmp_path, database):
 
 @pytest.fixture
 def make_run(store, tmp_path):
-    """Make a run that has ended, as `armscan.run` leaves it; return its id."""
+    """Make a run that has ended, as `armscan.run` leaves it; return its ID."""
 
     def make(
         name="tiny",
@@ -70,7 +70,7 @@ def make_run(store, tmp_path):
 
 @pytest.fixture
 def locked():
-    """Have another process hold a lock until the test ends."""
+    """Let another process hold a lock until the test ends."""
     with contextlib.ExitStack() as stack:
 
         def lock(file):
@@ -92,7 +92,7 @@ def answer(armscan, monkeypatch):
 
 @pytest.fixture
 def snapshot(tmp_path):
-    """Return every file of the test's folder with its contents, but for the database's own."""
+    """Return every file of the test's folder with its contents, except the database."""
 
     def look():
         files = (file for file in tmp_path.rglob("*") if not file.name.startswith("mlruns.db"))

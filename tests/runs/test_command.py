@@ -1,4 +1,4 @@
-"""The command that lists and prunes runs: on a server, beside a run that goes on, and with words that are none."""
+"""The command that lists and prunes runs: on a server, beside a running run, and with invalid arguments."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Runs listed and shown: filters, order, what is folded, what they take of the disk."""
+"""Runs listed and shown: filters, order, folded children, disk usage."""
 
 import csv
 import io
@@ -16,7 +16,7 @@ DAY_S = 86400.0
 
 @pytest.fixture
 def aged(tmp_path):
-    """Date a run days back, and let it have taken seconds."""
+    """Set the age of a run in days and its duration in seconds; return its ID."""
 
     def change(run_id, *, days=0.0, took_s=60.0):
         start_ms = round((time.time() - days * DAY_S) * 1000)
@@ -30,7 +30,7 @@ def aged(tmp_path):
 
 @pytest.fixture
 def listed(answer):
-    """Return the names of the runs that a list has, in its order."""
+    """Return the names of the listed runs, in order."""
 
     def names(*words):
         code, printed, errors = answer("list", "--format=json", *words)
@@ -46,7 +46,7 @@ def judged(success_rate, mean_steps):
 
 @pytest.fixture
 def three(make_run, aged):
-    """Return runs of other agents, ages and figures; the last was never judged."""
+    """Return runs of different agents, ages and metrics; the last was never evaluated."""
     tags = [{"choice.agent": agent, "choice.obs": obs} for agent, obs in (("sac", "slice"), ("ppo", "cluster"))]
     return [
         aged(make_run("a", tags=tags[0], figures=judged(0.5, 9.0)), days=1, took_s=30),
@@ -63,6 +63,7 @@ SELECTED = [
     (["--agent=ppo"], "bc"),
     (["--agent=ppo,sac", "--obs=slice"], "a"),
     (["--projection=zy"], "abc"),
+    (["--projection=y, zy"], "abc"),
     (["--projection=[rz,ty]"], ""),
     (["--since=7d"], "a"),
     (["--before=1w"], "bc"),
@@ -90,7 +91,7 @@ def test_list_has_what_is_asked_for_in_its_order(three, listed):
 
 @pytest.fixture
 def family(store, make_run, aged):
-    """Return a multirun of two jobs, of which one was evaluated; and a run beside it."""
+    """Return a multirun of two jobs, of which one was evaluated, with another run beside it."""
     client, experiment_id = store
     parent_id = client.create_run(experiment_id, name="multirun", tags={}).info.run_id
     client.set_terminated(parent_id)
@@ -108,7 +109,7 @@ def test_children_are_folded_into_their_parent_and_unfolded_where_that_is_asked_
     assert listed() == ["multirun", "alone"]
     assert listed("--children") == ["multirun", "job0", "evaluation", "job1", "alone"]
     assert listed(f"--parent={parent_id[:8]}") == ["job1", "job0"]
-    # Of a parent that is not meant, the children stand by themselves.
+    # If their parent is not selected, children stand by themselves.
     assert listed("--where=attributes.run_name LIKE 'job%'") == ["job1", "job0"]
     rows = json.loads(answer("list", "--format=json")[1])
     assert [row["below"] for row in rows] == [3, 0]
@@ -155,7 +156,7 @@ def test_long_names_stay_whole_and_odd_ones_are_no_markup(make_run, answer, monk
     assert above == name
     assert row.startswith(run_id[:8])
     assert len(row) <= 80
-    # A log takes them in one line.
+    # In a log, a row is one line.
     monkeypatch.delenv("COLUMNS")
     assert name in (row := answer("list")[1].splitlines()[-1])
     assert run_id[:8] in row
@@ -221,7 +222,7 @@ def test_times_are_readable():
 
 def test_run_that_goes_on_again_has_no_duration(answer, make_run, store, aged, listed):
     going_on, ended = aged(make_run("going_on"), took_s=90), aged(make_run("ended"), took_s=30)
-    # As a resumed one says it, whose end MLflow keeps.
+    # As for a resumed run, whose earlier end MLflow keeps.
     store[0].update_run(going_on, status="RUNNING")
     assert store[0].get_run(going_on).info.end_time is not None
     rows = {row["run_id"]: row["duration_s"] for row in json.loads(answer("list", "--format=json")[1])}
@@ -243,7 +244,7 @@ def test_control_characters_of_names_and_tags_do_not_reach_the_terminal(answer, 
 def test_runs_that_are_above_themselves_are_listed(make_run, store, listed):
     client, _ = store
     ids = {name: make_run(name) for name in "abcd"}
-    # Of two in a circle, with one below it, and one that is its own parent.
+    # Two are each other's parents, with one below them, and one is its own parent.
     for child, parent in ("ab", "ba", "cb", "dd"):
         client.set_tag(ids[child], "mlflow.parentRunId", ids[parent])
     assert set(listed("--children")) == set("abcd")

@@ -18,7 +18,7 @@ BY_COMMAND = EvaluationReport({"test volumes": evaluation_of(6)}, has_total=Fals
 
 @pytest.fixture
 def keep(tmp_path, database):
-    """Track a run with a file, of a run that it evaluates or of none; return its id."""
+    """Track a run with a file, as an evaluation of another run or of none; return its ID."""
     store, experiment_id = open_store(database, experiment="test", artifacts=str(tmp_path / "artifacts"), wait_s=60.0)
 
     def kept(name, text, of=None):
@@ -46,7 +46,7 @@ def test_card_has_the_latest_evaluation_that_has_kept_its_figures(keep, tmp_path
     assert f"### by evaluation {latest}, on b, success_threshold=0.2\n" in card.text
     assert earlier not in card.text
     assert "| steps, mean | 3.00 (2.00–4.00) |" in card.text
-    # The tags are the run's own, whose rules nobody has changed.
+    # The tags are of the run's own evaluation, by its own rules.
     assert card.tags["test_volumes/mean_steps"] == "3"
 
 

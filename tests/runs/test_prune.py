@@ -14,7 +14,7 @@ from armscan.utils.files import LOCK_FILE
 
 
 def ids_in(folder, stage="active"):
-    """Return the ids of the runs of a database, of those that are deleted with another stage."""
+    """Return the IDs of the runs of a database in a lifecycle stage: active or deleted."""
     with sqlite3.connect(folder / "mlruns.db") as database:
         found = database.execute("select run_uuid from runs where lifecycle_stage = ?", (stage,))
         return {run_id for (run_id,) in found}
@@ -62,7 +62,7 @@ def kept_files():
 
 
 def assert_stays(answer, run_id, reason, what="folders"):
-    """Check that a run is left with a reason, in the dry run and where it counts, and that this is no failure."""
+    """Check that a run is left with a reason, in the dry run and with --apply, and that this is no failure."""
     planned = answer("prune", what)[1]
     kept = kept_files()
     assert f"{run_id[:8]} stays: {reason}" in planned, planned
@@ -187,7 +187,7 @@ def test_folder_that_is_not_certainly_the_runs_is_left_and_said_so(answer, make_
 def test_folder_of_two_runs_is_left(answer, make_run, tmp_path):
     folder = tmp_path / "shared"
     first, second = make_run(folder=folder), make_run(folder=folder)
-    # As versions did that had no outboxes.
+    # As in earlier versions, which had no outboxes.
     shutil.rmtree(folder / "tracking")
     assert_stays(answer, first, f"{folder} is the folder of run {second}, too", "folders")
     assert (folder / "best.pt").exists()
@@ -296,7 +296,7 @@ def test_run_that_somebody_has_deleted_stays_as_it_is(answer, make_run, store, t
 def test_note_of_a_run_goes_with_its_folder(answer, make_run, monkeypatch, tmp_path):
     monkeypatch.setenv("ARMSCAN_CACHE", str(tmp_path / "cache"))
     run_id = make_run()
-    # As a run leaves it whose rest was delivered by `armscan runs sync`.
+    # As left by a run whose rest was delivered by `armscan runs sync`.
     note = tmp_path / "cache" / NOTES_FOLDER / run_id
     note.symlink_to(file_of(tmp_path / "outputs" / "tiny", run_id))
     assert answer("prune", "folders", "--apply")[0] == 0

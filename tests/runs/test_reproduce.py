@@ -1,4 +1,4 @@
-"""The command that makes a run again, as a person types it, on a real tracked run."""
+"""The command that reproduces a run, as a user types it, on a real tracked run."""
 
 import contextlib
 import json
@@ -24,7 +24,7 @@ METRIC, STEP = "validation/mean_steps", 208
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory, data_folder):
-    """Return a folder with volumes, which the configuration names from there, and with a run that has finished."""
+    """Return a folder with volumes, which the configuration names relative to it, and a finished run."""
     folder = tmp_path_factory.mktemp("made")
     shutil.copytree(data_folder, folder / "volumes")
     words = [word for word in SMALL if not word.startswith("data.")]

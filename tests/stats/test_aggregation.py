@@ -44,7 +44,7 @@ def test_probability_of_improvement_is_that_of_rliable_and_its_interval_is_mirro
 @pytest.mark.parametrize("difference", [0.0, 1.0, 2.0])
 def test_interval_of_improvement_holds_the_truth_in_more_than_92_percent_of_studies(n_seeds, difference):
     rng, n_studies = np.random.default_rng(0), 400
-    # With an effect of each training on all of eight volumes, and a rest.
+    # An effect of each training on all of eight volumes, and a residual.
     ours, others = (
         rng.standard_normal((n_studies, n_seeds, 1)) + 0.5 * rng.standard_normal((n_studies, n_seeds, 8))
         for _ in range(2)

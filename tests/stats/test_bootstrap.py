@@ -1,4 +1,4 @@
-"""Intervals: against NumPy's and SciPy's statistics, known values, and how often they hold the truth."""
+"""Intervals, compared with NumPy's and SciPy's statistics and known values, and their coverage."""
 
 import math
 import warnings
@@ -81,7 +81,7 @@ def test_intervals_hold_the_truth_about_as_often_as_they_say():
         by_volume, as_one = (estimates({"m": (mean, successes)}, each)["m"] for each in (volumes, [0] * 160))
         n_by_volume += by_volume.low <= 2 / 3 <= by_volume.high
         n_as_one += as_one.low <= 2 / 3 <= as_one.high
-    # Of eight volumes a bootstrap is somewhat too sure; one that takes episodes as independent is far too sure.
+    # With eight volumes a bootstrap is somewhat too narrow; one that takes episodes as independent is far too narrow.
     assert n_by_volume >= 175
     assert n_as_one <= 160
 
@@ -115,7 +115,7 @@ def test_interval_of_trainings_that_differ_is_wider_than_one_of_their_episodes()
 
 
 def test_all_trainings_meet_the_same_drawn_volumes():
-    # One volume of two is failed by all: it is drawn by all of them twice, once or not at all.
+    # All fail on one volume of two: it is drawn twice, once or not at all, for all of them alike.
     volumes, trainings = ["a", "b"] * 30, [place // 6 for place in range(60)]
     ours = estimates({"m": (mean, [0.0, 1.0] * 30)}, volumes, trainings=trainings)["m"]
     assert ours == (0.5, 0.0, 1.0)

@@ -37,7 +37,7 @@ def test_interval_of_one_seed_is_for_other_volumes_and_that_of_one_volume_for_ot
     values = np.random.default_rng(0).standard_normal((N_STUDIES, 1, 6))
     of_volumes, of_seeds = crossed_mean(values), crossed_mean(values.swapaxes(1, 2))
     assert np.allclose(of_volumes, of_seeds)
-    # Of one kind it is Student's.
+    # For one kind alone it is Student's.
     mean, half = values[0].mean(), 2.5706 * values[0].std(ddof=1) / np.sqrt(6)
     assert (of_volumes[0][0], of_volumes[1][0]) == pytest.approx((mean, half), rel=1e-4)
 

@@ -1,4 +1,4 @@
-"""Chromium without a window, for tests and for pictures of what is shown in a browser; nothing outside is reached."""
+"""Headless Chromium for tests and screenshots; it reaches nothing outside this machine."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ WORDS = (
     *("--disable-background-networking", "--disable-component-update", "--disable-sync", "--disable-quic"),
     *("--no-first-run", "--no-proxy-server", "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1"),
 )
-# MLflow opens its assistant's panel by itself, once.
+# Otherwise MLflow opens its assistant's panel on the first visit.
 BEFORE_EACH_PAGE = "localStorage.setItem('mlflow.assistant.fab.autoOpenedOnFirstLoad_v1', 'true')"
 FIND = """
     const isRead = (each, text) => (each.innerText ?? each.textContent).trim().replace(/\\s+/g, " ") === text;
     const seen = [...document.querySelectorAll(arguments[0])].filter((each) => each.getClientRects().length > 0);
     return seen.findLast((each) => arguments[1] === null || isRead(each, arguments[1])) ?? null;
 """
-# Once the charts have followed a change of the page's width.
+# After the charts have followed the change of the page's width.
 WIDER = """
     const done = arguments[0];
     setTimeout(() => done([...document.querySelectorAll("html, body *:not(.wide):not(.wide *)")].filter((each) =>
@@ -44,7 +44,7 @@ WIDER = """
 
 
 def programs() -> tuple[str, str] | None:
-    """Return the paths of the browser and its driver; None where one is not installed."""
+    """Return the paths of the browser and its driver; None if one is not installed."""
     browser, driver = (shutil.which(name) for name in PROGRAMS)
     return (browser, driver) if browser and driver else None
 
@@ -76,7 +76,7 @@ def chromium(profile: Path, *, width: int = 1400, height: int = 900) -> Iterator
 
 
 class Browser:
-    """A browser, in which everything is waited for.
+    """A browser that waits for whatever it is asked for.
 
     Args:
         driver: Driver of Selenium.
@@ -84,7 +84,7 @@ class Browser:
 
     def __init__(self, driver: Chrome) -> None:
         self.driver = driver
-        # While a page changes.
+        # Raised while a page changes.
         passing = (
             ElementClickInterceptedException,
             JavascriptException,
@@ -94,7 +94,7 @@ class Browser:
         self._wait = WebDriverWait(driver, HANG_S, poll_frequency=0.1, ignored_exceptions=passing)
 
     def before_each_page(self, program: str) -> None:
-        """Run JavaScript before those of a page."""
+        """Run JavaScript before the scripts of each page."""
         self.driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": program})
 
     def open(self, address: str) -> None:
@@ -107,7 +107,7 @@ class Browser:
         return self.driver.current_url
 
     def find(self, css: str, *, text: str | None = None) -> WebElement:
-        """Return an element on the page, of several the innermost, as soon as it is there.
+        """Wait for a visible element and return it; of several, the last one, which is the innermost.
 
         Args:
             css: CSS selector of the element.
@@ -122,7 +122,7 @@ class Browser:
         return self._seen(css, text) is not None
 
     def click(self, css: str, *, text: str | None = None) -> None:
-        """Click on an element, as soon as nothing is in its way."""
+        """Click on an element, as soon as nothing covers it."""
 
         def clicked(_: Chrome) -> bool:
             element = self.find(css, text=text)
@@ -137,7 +137,7 @@ class Browser:
         self.find(css).send_keys(text)
 
     def count(self, css: str, at_least: int) -> int:
-        """Wait until there are as many elements; return how many there are."""
+        """Wait until there are at least this many elements; return their number."""
 
         def counted(driver: Chrome) -> int:
             n = len(driver.find_elements(By.CSS_SELECTOR, css))
@@ -146,7 +146,7 @@ class Browser:
         return int(self._wait.until(counted, f"fewer than {at_least} of {css}"))
 
     def picture(self, css: str) -> int:
-        """Wait until a picture has been read, scroll to it, and return its width in pixels."""
+        """Scroll to a picture, wait until it has loaded, and return its width in pixels."""
 
         def read(driver: Chrome) -> int:
             image = driver.find_element(By.CSS_SELECTOR, css)
@@ -156,7 +156,7 @@ class Browser:
         return int(self._wait.until(read, f"no picture {css}"))
 
     def wider_than_page(self, width: int) -> list[str]:
-        """Return what does not fit a page that is as wide as said, by its tag and class; charts may be scrolled."""
+        """Return the tags and classes of elements that overflow a page of this width; charts may be scrolled."""
         size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 500}
         self.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
         found = self.driver.execute_async_script(WIDER)
@@ -164,7 +164,7 @@ class Browser:
         return found
 
     def keep(self, file: Path) -> None:
-        """Keep what is seen."""
+        """Save a screenshot."""
         file.parent.mkdir(parents=True, exist_ok=True)
         assert self.driver.save_screenshot(str(file))
 

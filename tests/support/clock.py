@@ -1,4 +1,4 @@
-"""A wall clock for processes of a test that can be set while they run; their monotonic clock goes on as it is."""
+"""A wall clock for a test's processes that can be set while they run; their monotonic clock stays unchanged."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from tests.support.requirements import unavailable
 
 LIBRARIES = Path("/usr/lib")
-# libfaketime answers Python's own `time.sleep`, which names a monotonic moment, with an error.
+# Python's own `time.sleep` passes an absolute monotonic time, on which libfaketime fails.
 SLEEP = "import select, time\ntime.sleep = lambda seconds: select.select([], [], [], seconds) and None\n"
 
 
@@ -28,7 +28,7 @@ class WallClock:
         (folder / "sitecustomize.py").write_text(SLEEP)
         self._file = folder / "offset"
         self.set(0)
-        # Of the processes that have this clock.
+        # Environment of the processes that have this clock.
         self.environment = os.environ | {
             "LD_PRELOAD": str(libraries[0]),
             "PYTHONPATH": os.pathsep.join([str(folder), *filter(None, [os.environ.get("PYTHONPATH")])]),
@@ -38,7 +38,7 @@ class WallClock:
         }
 
     def set(self, hours: int) -> None:
-        """Set it to so many hours after the time that it is."""
+        """Set it to this many hours after the real time."""
         written = self._file.with_suffix(".new")
         written.write_text(f"{hours:+d}h\n")
         written.replace(self._file)

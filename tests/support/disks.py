@@ -1,4 +1,4 @@
-"""A disk of its own for tests, which can be filled."""
+"""A small disk for tests, which can be filled."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Disk:
         self.folder = folder
 
     def fill(self) -> None:
-        """Take all that is left of it, but for what is freed later."""
+        """Fill all space that is free now."""
         with (self.folder / FILLER).open("ab", buffering=0) as file:
             for n_bytes in (2**16, 1):
                 try:
@@ -34,7 +34,7 @@ class Disk:
                     continue
 
     def empty(self) -> None:
-        """Give back what `fill` has taken."""
+        """Free the space that `fill` has taken."""
         (self.folder / FILLER).unlink()
 
     def enlarge(self, size: str) -> None:
@@ -47,7 +47,7 @@ def small_disk(folder: Path, size: str) -> Iterator[Disk]:
     """Mount a disk for the block; skip the test if none can be mounted.
 
     Args:
-        folder: Folder that it is mounted on; made if it is missing.
+        folder: Folder that it is mounted on; created if missing.
         size: Size as `mount` takes it, such as 20m.
     """
     folder.mkdir(parents=True, exist_ok=True)

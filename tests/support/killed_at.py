@@ -1,7 +1,7 @@
-"""Runs commands in processes that kill themselves at a chosen moment, as `kill -9` would: a program of its own.
+"""A program that runs commands in processes that kill themselves at a chosen moment, as `kill -9` would.
 
 Each line of its input is an order: the command's words, and the moment. The libraries are loaded once, and each command
-runs in a fork, whose output goes to the file `printed`; the line that answers says how it ended.
+runs in a fork, whose output goes to the file `printed`. The answer is a line with its exit code.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ class Moment:
     Args:
         place: Function or method, such as `torch.optim:Adam.step`.
         number: Number of the call that ends the process, from 1.
-        delay_s: Seconds after the beginning of that call; the call is followed by the end in any case. Default:
-            None, before the call.
+        delay_s: Seconds after the start of that call, but at the latest when it returns. Default: None, before the
+            call.
     """
 
     place: str
@@ -37,7 +37,7 @@ class Moment:
     delay_s: float | None = None
 
     def wait(self) -> None:
-        """Have this process kill itself then."""
+        """Make this process kill itself at that moment."""
         module, _, path = self.place.partition(":")
         *owners, name = path.split(".")
         owner: Any = functools.reduce(getattr, owners, importlib.import_module(module))

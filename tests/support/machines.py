@@ -1,4 +1,4 @@
-"""Two machines for tests, joined by a cable: each a network namespace with a name of its own for its processes."""
+"""Two machines for tests, joined by a cable: each is a network namespace with its own host name."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CABLE, BITS = "cable", 24
 
 @dataclass(frozen=True)
 class Machine:
-    """One of them, which is nowhere to be reached but from the other.
+    """One of the two machines, reachable only from the other.
 
     Args:
         name: Name of the namespace, which its processes take for the host name.
@@ -30,7 +30,7 @@ class Machine:
     address: str
 
     def command(self, *words: str) -> list[str]:
-        """Return the words that have a command run there."""
+        """Return the command line that runs a command there."""
         renamed = 'hostname "$0" && exec "$@"'
         return ["ip", "netns", "exec", self.name, "unshare", "--uts", "sh", "-c", renamed, self.name, *words]
 
@@ -45,7 +45,7 @@ class Machine:
                 _enter(before.fileno())
 
     def processes(self) -> list[int]:
-        """Return the ids of the processes that are there, but for this one."""
+        """Return the IDs of the processes that run there, except this one."""
         told = subprocess.run(["ip", "netns", "pids", self.name], capture_output=True, text=True, check=True).stdout
         return [int(pid) for pid in told.split() if int(pid) != os.getpid()]
 
@@ -55,7 +55,7 @@ class Machine:
 
 
 def why_not() -> str | None:
-    """Return why no machines can be made here, None where they can."""
+    """Return why no machines can be made here; None if they can."""
     for program, package in (("ip", "iproute2"), ("unshare", "util-linux"), ("hostname", "hostname")):
         if shutil.which(program) is None:
             return f"{program} is not installed: apt-get install {package}"

@@ -1,4 +1,4 @@
-"""An MLflow server of one's own, for tests and benchmarks: on a free port of this machine, gone when it is left."""
+"""A private MLflow server for tests and benchmarks, on a free port of this machine."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class MlflowServer:
         words = ["server", "--host", self._host, "--port", str(self.port), "--workers", "1"]
         words += ["--artifacts-destination", str(self.artifacts)]
         with self.log.open("ab") as log:
-            # In a group of its own, in which its own processes are ended, too.
+            # In its own process group, so that its child processes are ended, too.
             self._process = subprocess.Popen(
                 [Path(sys.executable).with_name("mlflow"), *words],
                 cwd=self._folder,

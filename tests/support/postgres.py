@@ -1,4 +1,4 @@
-"""A PostgreSQL server of one's own, for tests and benchmarks: on a free port of this machine, gone when it is left."""
+"""A private PostgreSQL server for tests and benchmarks, on a free port of this machine."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ LOOPBACK = "127.0.0.1"
 
 
 def programs() -> Path | None:
-    """Return the folder with PostgreSQL's programs, Debian's newest before those on the path; None where none are."""
+    """Return the folder of PostgreSQL's programs, Debian's newest before those on the path; None if there are none."""
     of_debian = sorted(DEBIAN.glob("*/bin"), key=lambda folder: float(folder.parent.name), reverse=True)
     on_path = [Path(found).parent] if (found := shutil.which("initdb")) else []
     return next((each for each in (*of_debian, *on_path) if all((each / name).exists() for name in PROGRAMS)), None)
@@ -34,7 +34,7 @@ def programs() -> Path | None:
 def postgres_server(host: str = LOOPBACK, **settings: str) -> Iterator[PostgresServer]:
     """Start a server with these settings beside PostgreSQL's own; stop it at the end of the block.
 
-    This process and those that it starts have the password from the file that PGPASSFILE names.
+    This process and its children read the password from the file that PGPASSFILE names.
     """
     folder = Path(tempfile.mkdtemp(prefix="armscan-postgres-"))
     before = os.environ.get("PGPASSFILE")
@@ -89,7 +89,7 @@ class PostgresServer:
 
     def start(self) -> None:
         """Start it, and wait until it answers."""
-        # Without fsync: it is only the server that is killed here, and never the machine.
+        # Without fsync: only the server is killed here, never the machine.
         own = {"port": self.port, "listen_addresses": self._host, "unix_socket_directories": "", "fsync": "off"}
         words = [word for key, value in (self._settings | own).items() for word in ("-c", f"{key}={value}")]
         self._process = self._started("postgres", "-D", self._data, *words)
@@ -119,7 +119,7 @@ class PostgresServer:
         return self.uri(name)
 
     def execute(self, statement: str) -> list[tuple[Any, ...]]:
-        """Execute a statement in the database that is always there; return its rows."""
+        """Execute a statement in the database `postgres`; return its rows."""
         import psycopg
 
         with psycopg.connect(self.uri("postgres"), password=PASSWORD, autocommit=True) as connection:
@@ -145,13 +145,13 @@ class PostgresServer:
             group = pwd.getpwnam(self._account).pw_gid
             account = {"user": self._account, "group": group, "extra_groups": []}
         with self._log.open("ab") as log:
-            # In a session of its own: to the server, a Ctrl-C that is meant for who started it would be a stop.
+            # In its own session: a Ctrl-C for the parent process would stop the server, too.
             return subprocess.Popen(
                 [self._programs / program, *words], cwd="/", stdout=log, stderr=log, start_new_session=True, **account
             )
 
 
 def _account() -> str:
-    """Return who a server is run as where this process is root."""
+    """Return the account that runs the server if this process is root."""
     known = {each.pw_name for each in pwd.getpwall()}
     return "postgres" if "postgres" in known else "nobody"

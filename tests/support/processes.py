@@ -12,7 +12,7 @@ from tests.support.waiting import wait_until
 
 
 def processes_in(folder: Path) -> list[int]:
-    """Return the processes whose working folder this is."""
+    """Return the IDs of the processes with this working folder."""
     listing = subprocess.run(["ps", "-eo", "pid="], capture_output=True, text=True, check=True).stdout.split()
     found = []
     for pid in listing:
@@ -25,7 +25,7 @@ def processes_in(folder: Path) -> list[int]:
 
 
 def with_variable(name: str, value: str) -> list[int]:
-    """Return the ids of the processes that were started with a variable in their environment."""
+    """Return the IDs of the processes that were started with a variable in their environment."""
     wanted, found = f"{name}={value}".encode(), []
     for folder in Path("/proc").iterdir():
         if folder.name.isdigit() and int(folder.name) != os.getpid():
@@ -40,7 +40,7 @@ def with_variable(name: str, value: str) -> list[int]:
 
 
 def kill(pids: Iterable[int], how: signal.Signals = signal.SIGKILL) -> None:
-    """Send a signal to those that are still there."""
+    """Send a signal to the processes that still exist."""
     for pid in pids:
         try:
             os.kill(pid, how)

@@ -1,4 +1,4 @@
-"""A Ray cluster of one's own for tests: of two machines that nobody else reaches, gone when it is left."""
+"""A private Ray cluster for tests, of two machines that nobody else reaches."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ HEALTH = {
 
 
 def why_not_here() -> str | None:
-    """Return why there can be no cluster here, None where there can."""
+    """Return why there can be no cluster here; None if there can."""
     if importlib.util.find_spec("ray") is None:
         return "Ray is not installed: pip install 'armscan[ray]'"
     return why_not()
@@ -55,14 +55,14 @@ def ray_cluster(environment: Mapping[str, str]) -> Iterator[RayCluster]:
     Args:
         environment: Environment variables of both machines, beside those of this process.
     """
-    # Short, because the paths of sockets are limited.
+    # Short, because the length of socket paths is limited.
     folder = Path(tempfile.mkdtemp(prefix="armscan-ray-"))
     try:
         with two_machines() as (head, other):
             token = folder / "token"
             token.touch(mode=0o600)
             token.write_text(secrets.token_hex(32))
-            # Said in any case: what was used on this machine before decides otherwise.
+            # Set explicitly: otherwise earlier uses on this machine decide.
             access = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN_PATH": str(token), "RAY_USAGE_STATS_ENABLED": "0"}
             address = f"{head.address}:{PORT}"
             of_nodes = access | HEALTH | environment
@@ -81,7 +81,7 @@ def _start(machine: Machine, folder: Path, environment: Mapping[str, str], *word
     with (folder / f"{machine.address}.log").open("ab") as log:
         ended = subprocess.run(
             machine.command(program, "start", f"--object-store-memory={OBJECT_STORE_BYTES}", *words),
-            # Another directory than that of who uses it.
+            # Not the folder of the command that uses it.
             cwd=own,
             env=os.environ | environment,
             stdout=log,

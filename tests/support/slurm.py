@@ -1,4 +1,4 @@
-"""A Slurm of one's own for tests: one node, this machine, on free ports of its loopback, gone when it is left."""
+"""A private Slurm for tests: one node, this machine, on free ports of its loopback."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SlurmdPort={slurmd_port}
 # On the loopback only, which {host} is made to be.
 CommunicationParameters=NoInAddrAny,NoCtldInAddrAny
 AuthType=auth/munge
-# A job that is queued again starts when the permit of its first start has expired; less than this is not allowed.
+# A requeued job starts only after the credential of its first start has expired; less than this is not allowed.
 AuthInfo=socket={folder}/munge.socket,cred_expire=5
 StateSaveLocation={folder}/state
 SlurmdSpoolDir={folder}/spool
@@ -43,7 +43,7 @@ AccountingStorageType=accounting_storage/none
 MpiDefault=none
 SelectType=select/cons_tres
 SelectTypeParameters=CR_Core
-# As many as are said, however many there are.
+# CPUs as given below, however many there are.
 SlurmdParameters=config_overrides
 ReturnToService=2
 KillWait=15
@@ -54,15 +54,15 @@ PartitionName=all Nodes=node Default=YES MaxTime=INFINITE State=UP
 
 
 def missing_program() -> str | None:
-    """Return a program of Slurm that is not installed, None where all are."""
-    # Where Debian has them, the path of a user has not.
+    """Return a program of Slurm that is not installed; None if all are."""
+    # Debian installs daemons outside a user's path.
     return next((each for each in PROGRAMS if _found(each) is None), None)
 
 
 @contextmanager
 def slurm() -> Iterator[Slurm]:
     """Start a Slurm; stop it at the end of the block."""
-    # Short, because the paths of sockets are limited.
+    # Short, because the length of socket paths is limited.
     folder = Path(tempfile.mkdtemp(prefix="armscan-slurm-"))
     # Munge wants everybody to reach its socket.
     folder.chmod(0o711)
@@ -118,7 +118,7 @@ class Slurm:
                 process.kill()
                 process.wait()
         self._processes.clear()
-        # Steps of jobs live on without the daemons.
+        # Job steps outlive the daemons.
         end_all(lambda: with_variable(CONF, str(self._conf)))
 
     def told(self, *command: str) -> str:
@@ -127,12 +127,12 @@ class Slurm:
         return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
 
     def jobs(self) -> dict[str, str]:
-        """Return the states of the jobs that are queued or running, by their ids."""
+        """Return the states of the queued and running jobs, by their IDs."""
         lines = self.told("squeue", "--noheader", "--array", "--format=%i %T").splitlines()
         return dict(line.split() for line in lines)
 
     def log(self) -> str:
-        """Return what its daemons have said."""
+        """Return the logs of its daemons."""
         return "\n".join(file.read_text(errors="replace") for file in sorted(self._folder.glob("*.log")))
 
     def _started(self, program: str, *words: str) -> None:
@@ -158,7 +158,7 @@ def _found(program: str) -> str | None:
 
 
 def _free_ports(n: int) -> list[int]:
-    # All at once, so that they are different ones.
+    # All at once, so that they differ.
     with ExitStack() as stack:
         sockets = [stack.enter_context(socket.socket()) for _ in range(n)]
         for each in sockets:

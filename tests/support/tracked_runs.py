@@ -1,4 +1,4 @@
-"""Tracked runs of agents that have learned nothing, in a moment."""
+"""Tracked runs of untrained agents, made in a moment."""
 
 import contextlib
 import json
@@ -25,7 +25,7 @@ GUESSER = {"_target_": "tests.support.tracked_runs.Guesser"}
 
 
 class Guesser:
-    """A baseline: an algorithm and its agent, which draws planes."""
+    """A baseline that draws random planes, algorithm and agent in one."""
 
     def agent(self, setup):
         self._n_action = len(setup.action_names)
@@ -39,14 +39,14 @@ class Guesser:
 
 
 class GuesserOfAnything(Guesser):
-    """The same, for any other configuration."""
+    """The same, with any arguments."""
 
     def __init__(self, **_):
         pass
 
 
 def tracked(folder, *overrides, agent=None, kept=("config.yaml", "volumes.json", "best.pt"), has_tag=True, few=FEW):
-    """Track a run of an agent that has learned nothing, started in this folder; return its id."""
+    """Track a run of an untrained agent, started in this folder; return its ID."""
     config = compose([*few, *overrides])
     OmegaConf.resolve(config)
     if agent:

@@ -1,4 +1,4 @@
-"""A backend of Matplotlib whose windows nobody sees: what is drawn can be looked at, what is clicked is heard."""
+"""A Matplotlib backend with invisible windows, whose contents can be read and which react to clicks."""
 
 from matplotlib.backend_bases import FigureManagerBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg

@@ -23,7 +23,7 @@ def wait_until(
         is_seen: Function that returns whether it is true now.
         process: Process that must be alive until then. Default: None.
         log: Function that returns the text to show if it never becomes true.
-        poll_s: Pause between two looks, in seconds.
+        poll_s: Pause between two checks, in seconds.
     """
     until_s = time.monotonic() + HANG_S
     while not is_seen():

@@ -1,13 +1,22 @@
 """Storages of every kind, and studies in them that train nothing."""
 
+import shutil
+from types import SimpleNamespace
+
 import optuna
 import pytest
+from omegaconf import OmegaConf
 from optuna.trial import TrialState
 
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
 from armscan.sweeps.scheduling.state import Limits, PendingWrites, TrialOutcome
 from armscan.sweeps.storage.attribute_names import FAILURE
 from armscan.sweeps.storage.storage import open_storage
+from armscan.sweeps.study.open import open_for_work
+from armscan.tracking import open_store
+from tests.sweeps.study.test_study import settings
+
+TASK = SimpleNamespace(run=None, validate=None, evaluate=None, final_metric="test/mean_steps")
 
 
 @pytest.fixture(params=["journal", *(pytest.param(each, marks=pytest.mark.full) for each in ("sqlite", "postgresql"))])
@@ -32,6 +41,21 @@ def make_scheduler(storage_uri):
         return TrialScheduler(study, storage, Limits(**{"n_trials": 5} | limits), plan)
 
     return make
+
+
+@pytest.fixture
+def opened(tmp_path, empty_database, monkeypatch):
+    """Return a function that opens a study by storage and name; all are tracked in one store."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(empty_database, tmp_path / "runs.db")
+    tracking = {"uri": "sqlite:///runs.db", "experiment": "a", "artifacts": "artifacts", "wait_s": 60.0}
+
+    def open_study(storage="optuna.journal", name="a", **changes):
+        asked = settings(name=name, storage=storage, folder=f"studies/{name}", **changes)
+        return open_for_work(asked, TASK, OmegaConf.create({"tracking": tracking}), ["sweep=sac_y"])
+
+    open_study.store = open_store(**tracking)
+    return open_study
 
 
 def fail(scheduler, trial, reason):

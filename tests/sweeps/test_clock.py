@@ -40,7 +40,7 @@ def test_study_whose_clock_jumps_an_hour_either_way_finishes_every_trial_once(tm
     assert study.wait(HANG_S) == 0, printed.read_text()
     trials = trials_of(tmp_path)
     assert [trial.state for trial in trials] == [TrialState.COMPLETE] * N_TRIALS
-    # The jumps are there to be seen, or nothing was tried.
+    # The jumps are visible, otherwise nothing was tested.
     began = [trial.datetime_start for trial in trials]
     assert max(began) - min(began) > timedelta(minutes=55)
     client = MlflowClient(f"sqlite:///{tmp_path}/mlruns.db")

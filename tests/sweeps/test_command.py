@@ -1,4 +1,4 @@
-"""Studies as a person starts them: real workers, killed and interrupted, on phantoms."""
+"""Studies as a user starts them: real workers, killed and interrupted, on phantoms."""
 
 import csv
 import json
@@ -115,14 +115,14 @@ def test_study_runs_its_trials_judges_the_best_and_goes_on_when_it_is_asked_for_
     runs = client.search_runs([client.get_experiment_by_name("armscan").experiment_id])
     by_id = {each.info.run_id: each for each in runs}
     assert {each.info.status for each in runs} == {"FINISHED"}
-    # Of all that was trained, only what judges keeps its policy.
+    # Only the trainings of the judgement keep their policies.
     kept = [each.data.tags["folder"] for each in runs if each.data.tags.get("policy") == "kept"]
     assert sorted(kept) == sorted(str(model.parent.parent) for model in tmp_path.glob("studies/**/MLmodel"))
     assert all("/judged/" in folder for folder in kept)
     assert len(kept) == len(trials_of(tmp_path, "sac_y-judged"))
-    # And has a film.
+    # They alone have a film.
     assert sorted(str(film.parent) for film in tmp_path.glob("studies/**/episode.gif")) == sorted(kept)
-    # So does the model of MLflow, and the study's run has the result, beside the random agent.
+    # They alone have a model in MLflow. The study's run has the result, beside the random agent.
     models = client.search_logged_models([runs[0].info.experiment_id])
     assert sorted(by_id[each.source_run_id].data.tags["folder"] for each in models) == sorted(kept)
     storage = open_storage(str(tmp_path / "optuna.journal")).optuna
@@ -133,7 +133,7 @@ def test_study_runs_its_trials_judges_the_best_and_goes_on_when_it_is_asked_for_
     assert get_note(optuna.load_study(study_name="sac_y", storage=storage)).endswith(note)
     assert {"random/mean_steps", "test_volumes/mean_steps"} <= study_run.data.metrics.keys()
     for trial in trials_of(tmp_path):
-        # Trial, run, folder and configuration know each other.
+        # Trial, run, folder and configuration refer to each other.
         tracked = by_id[trial.user_attrs["mlflow_run"]]
         assert tracked.data.tags["mlflow.parentRunId"] == study_run.info.run_id
         assert tracked.data.tags["trial"] == str(trial.number)
@@ -211,7 +211,7 @@ def test_study_survives_a_killed_worker_and_hands_its_trials_back_when_it_is_int
     at_s = time.monotonic()
     os.killpg(process.pid, signal.SIGINT)
     assert process.wait(HANG_S) == 130
-    # Five on a machine that does nothing else; the trials would go on for many minutes.
+    # Five seconds on an idle machine; the trials would go on for many minutes.
     assert time.monotonic() - at_s < 60
     assert processes_in(tmp_path) == []
     assert sorted(trial.state.name for trial in trials_of(tmp_path)) == ["FAIL", "WAITING", "WAITING"]

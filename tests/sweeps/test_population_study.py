@@ -1,4 +1,4 @@
-"""Population-based training as a person starts it: real workers, killed at random moments."""
+"""Population-based training as a user starts it: real workers, killed at random moments."""
 
 import json
 import os
@@ -50,7 +50,7 @@ study:
 
 
 def kill_a_worker(folder, process, drawn, n_complete):
-    """Kill a worker once so many trials are complete: when it has claimed one, opened its run, or reported."""
+    """Kill a worker once `n_complete` trials are complete: when it has claimed one, opened its run, or reported."""
     moment = drawn.choice(["claimed", "opened", "reported"])
 
     def holders():
@@ -73,7 +73,7 @@ def kill_a_worker(folder, process, drawn, n_complete):
 
 
 def replayed(folder, trial):
-    """Replay a member with the one command that is told; return what that says, and the weights of both."""
+    """Replay a member with the command that a study prints; return its output, and the weights of both."""
     of_trial = folder / trial.user_attrs["folder"] / "seed_0"
     run_id = json.loads((of_trial / "run.json").read_text())["run_id"]
     again = folder / f"again-{trial.number}"

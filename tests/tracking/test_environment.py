@@ -28,7 +28,7 @@ def test_packages_in_the_folder_of_another_package_are_left_out(monkeypatch, tmp
         (tmp_path / folder / f"{name}-1.0.dist-info").mkdir(parents=True)
         (tmp_path / folder / f"{name}-1.0.dist-info" / "METADATA").write_text(f"Name: {name}\nVersion: 1.0\n")
         monkeypatch.syspath_prepend(tmp_path / folder)
-    # As a process finds them that has not asked before.
+    # As in a process that has not cached them.
     packages = environment.__wrapped__()["packages"]
     assert packages["alone"] == "1.0"
     assert "within" not in packages

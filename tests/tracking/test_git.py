@@ -52,7 +52,7 @@ def test_source_keeps_every_change_so_that_it_can_be_applied_again(repository, t
     (repository / "inner" / "new.bin").write_bytes(bytes(range(255)))
     (repository / "staged.py").write_text("staged\n")
     git(repository, "add", "staged.py")
-    # What a person has set for their own eyes.
+    # A user's own display settings.
     git(repository, "config", "color.ui", "always")
     git(repository, "config", "diff.noprefix", "true")
     found = source_in(repository / "inner")
@@ -115,7 +115,7 @@ def test_source_without_git_is_unknown(repository, tmp_path, monkeypatch):
     (tmp_path / "bare").mkdir()
     unknown = {"git.commit": "unknown", "git.dirty": "unknown"}
     assert source_in(tmp_path / "bare").tags == unknown
-    # Of a package that lies in the tree of another project, nobody has added anything there.
+    # A package that lies in the tree of another project, which does not track it.
     (installed := repository / ".venv" / "armscan").mkdir(parents=True)
     (installed / "code.py").write_text("installed\n")
     assert source_in(installed).tags == unknown

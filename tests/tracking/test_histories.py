@@ -47,7 +47,7 @@ def test_histories_of_many_runs_are_those_of_each(store, made, monkeypatch):
     asked = one_by_one(*made)
     assert all(each["x"] == {5: 0.3, 9: 2.0} for each in asked.values())
     assert metric_histories(store, made[1]) == asked
-    # Requests that would be longer than a server answers.
+    # Split as requests are that would be longer than a server answers.
     monkeypatch.setattr(histories, "MAX_RUNS", 2)
     monkeypatch.setattr(histories, "MAX_POINTS", 4)
     assert metric_histories(store, made[1]) == asked

@@ -90,7 +90,7 @@ def test_outbox_names_a_file_that_does_not_say_what_it_is_of(tmp_path, contents)
     file.write_bytes(contents)
     with pytest.raises(TrackingError, match="does not begin with the ID of its run"):
         Outbox(file)
-    # Nobody holds what could not be opened.
+    # An outbox that could not be opened is not locked.
     file.write_bytes(json.dumps({"address": {"run_id": "b", "uri": "c"}}).encode() + b"\n")
     Outbox(file, timeout_s=0.0).close()
 
@@ -109,10 +109,10 @@ def test_outbox_delivers_all_again_where_nobody_knows_what_was_delivered(outbox,
 
 
 def hold(folder, is_held):
-    folder_lock = Outbox.begin(folder, ADDRESS)
+    held = Outbox.begin(folder, ADDRESS)
     is_held.set()
     time.sleep(HANG_S)
-    folder_lock.close()
+    held.close()
 
 
 def test_outbox_is_held_by_one_process_until_that_dies(tmp_path):

@@ -1,4 +1,4 @@
-"""Names and values as MLflow takes them."""
+"""Names and values that MLflow accepts."""
 
 import pytest
 from hypothesis import given

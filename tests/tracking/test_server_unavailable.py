@@ -28,7 +28,7 @@ N_EPOCHS = 30
 
 @pytest.fixture(scope="module")
 def server(postgres, tmp_path_factory):
-    """Yield a server that tests may stop; each starts it again."""
+    """Yield a server that tests may stop; each must start it again."""
     with mlflow_server(tmp_path_factory.mktemp("server"), postgres.make_database()) as server:
         yield server
 
@@ -54,18 +54,18 @@ def test_what_a_run_could_not_deliver_the_next_start_delivers(server, opened, tm
     server.stop()
     tracked.log_metrics({"x": 1.0}, n_env_steps=7)
     assert not tracked.end("FINISHED", wait_s=0.1)
-    # One that is still going on delivers for itself; one whose folder was removed is forgotten.
+    # A run that is still going on delivers by itself; one whose folder was removed is forgotten.
     gone = tmp_path / "gone"
     server.start()
     going_on, removed = begun(opened, tmp_path / "going on"), begun(opened, gone)
-    # Its thread would write beside what is being removed.
+    # Otherwise its thread would write into the folder while it is removed.
     assert removed._uploader.finish(HANG_S) is None
     removed._outbox.close()
     shutil.rmtree(gone)
     assert {tracked.run_id, going_on.run_id, removed.run_id} <= notes().keys()
-    # A note that was never written to its end is in nobody's way.
+    # A note that was only partly written does no harm.
     (cache_folder() / "undelivered" / "0").write_bytes(b"\0")
-    # Of the package, `sync` is the function.
+    # In the package's namespace, `sync` is the function.
     monkeypatch.setattr(sys.modules["armscan.tracking.sync"], "_looked_for", set())
     for _ in range(2):
         deliver_pending(opened[0])
@@ -98,7 +98,7 @@ def test_run_goes_on_while_the_server_is_away_and_nothing_is_lost_or_there_twice
     file = tmp_path / "best.pt"
     file.write_text("weights")
     tracked.log_files(file)
-    # With a server that is unavailable each request takes seconds; a training waits for a line in a file only.
+    # With an unavailable server each request takes seconds; a training only waits for a line in a file.
     assert senders
     assert threading.current_thread() not in senders
     assert tracked.end("FINISHED")
@@ -111,7 +111,7 @@ def test_run_goes_on_while_the_server_is_away_and_nothing_is_lost_or_there_twice
     assert (run.info.status, run.data.params) == ("FINISHED", {"seed": "3"})
     assert [file.path for file in client.list_artifacts(tracked.run_id)] == ["best.pt"]
     said = [line.partition("  ")[2] for line in capfd.readouterr().out.splitlines()]
-    # Once each, and between them at most that the end of the run waits.
+    # Once each, and between them at most the line that the end of the run waits.
     first = f"{server.uri} cannot be reached or written to (Connection refused): what is tracked is kept in "
     assert said[0] == first + str(file_of(tmp_path, tracked.run_id))
     assert said[-1] == f"{server.uri} is back: everything is delivered"
@@ -209,7 +209,7 @@ def test_store_is_waited_for_with_a_retry_policy(server, capfd):
 
 
 def test_figures_are_kept_where_files_cannot_be_because_the_disk_is_full(tmp_path, monkeypatch, capfd):
-    """Something in the way of the folder stands for the disk: what is raised is an `OSError` in both cases."""
+    """A file in the way of the folder stands in for a full disk: both raise an `OSError`."""
     uri, artifacts = f"sqlite:///{tmp_path}/runs.db", tmp_path / "artifacts"
     store, experiment_id = open_store(uri, experiment="test", artifacts=str(artifacts), wait_s=1.0)
     artifacts.write_text("in the way")
@@ -228,7 +228,7 @@ def test_figures_are_kept_where_files_cannot_be_because_the_disk_is_full(tmp_pat
 
 @pytest.fixture
 def artifacts_disk(tmp_path):
-    """Yield a disk for the server's artifacts, of 256 KiB."""
+    """Yield a disk of 256 KiB for the server's artifacts."""
     with small_disk(tmp_path / "server" / "artifacts", "256k") as disk:
         yield disk
 
@@ -268,7 +268,7 @@ def test_runs_of_a_dead_process_are_ended_and_those_of_a_living_one_are_not(open
     store, _ = opened
     dead, alive = begun(opened, tmp_path / "dead"), begun(opened, tmp_path / "alive")
     dead.log_metrics({"x": 1.0}, n_env_steps=7)
-    # As the system does for who is killed.
+    # As the system does with a killed process.
     dead._uploader._stopped.set()
     dead._outbox.close()
     abandon(tmp_path, store, "its worker died")
@@ -297,7 +297,7 @@ def test_sync_goes_on_after_what_it_cannot_deliver(opened, server, tmp_path, cap
     assert "a line of it is damaged: b'nonsense" in told
     assert f"the rest is left: {tmp_path}/elsewhere/best.pt is not there" in told
     assert histories(server.uri, runs[2].run_id) == {"x": [(7, 1.0)]}
-    # What was copied without its files is not taken for delivered: these may come yet.
+    # An outbox that was copied without its files is not taken for delivered: they may still come.
     (tmp_path / "elsewhere" / "best.pt").write_text("weights")
     assert [delivery.left for delivery in sync(tmp_path / "elsewhere", lambda _: store, trust=True)] == [None]
     files = MlflowClient(server.uri).list_artifacts(runs[1].run_id)

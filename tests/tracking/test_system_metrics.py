@@ -1,4 +1,4 @@
-"""The machine, looked at while a run trains."""
+"""System metrics, sampled while a run trains."""
 
 import threading
 

@@ -51,7 +51,7 @@ def store(tmp_path, database):
 
 
 def eventually(look, is_there):
-    """Return what is seen as soon as it is what it must become."""
+    """Wait until `look` returns what `is_there` accepts, and return that."""
     wait_until(lambda: is_there(look()), log=look)
     return look()
 
@@ -123,7 +123,7 @@ def test_folder_that_was_removed_before_it_was_delivered_is_told(store, tmp_path
     outbox = Outbox.begin(tmp_path, Address(run_id, client.uri))
     outbox.add(file=["policy/MLmodel", "policy"])
     outbox.add(file="best.pt")
-    # Of a folder that was copied, the file may be elsewhere.
+    # If the folder was copied, the file may be elsewhere.
     with pytest.raises(FileNotFoundError, match="policy/MLmodel is not there"):
         deliver(outbox, client.mlflow, "files", is_whole=False)
     assert deliver(outbox, client.mlflow, "files") == 2
@@ -147,7 +147,7 @@ def test_file_outside_of_a_strangers_folder_is_not_uploaded(store, tmp_path, kin
     (delivery,) = sync(tmp_path, lambda _: client)
     assert "is outside of the run's folder" in delivery.left
     assert client.list_artifacts(run_id) == []
-    # Nor by one that goes on with the run.
+    # Nor by a process that resumes the run.
     with contextlib.closing(Outbox.begin(folder, Address(run_id, client.uri))) as outbox:
         outbox.note()
         with pytest.raises(UntrustedError, match="add --trust"):
@@ -240,7 +240,7 @@ def test_store_whose_artifacts_cannot_be_written_is_refused_before_anything_is_m
         open_store(uri, experiment="new", artifacts=str(tmp_path / "taken" / "inside"), wait_s=60.0)
     client, _ = open_store(uri, experiment="other", artifacts=str(tmp_path / "artifacts"), wait_s=60.0)
     assert {each.name for each in client.search_experiments()} == {"Default", "other"}
-    # Where the experiment is there already, it says where its artifacts lie.
+    # An existing experiment determines where its artifacts lie.
     (tmp_path / "artifacts").write_text("no folder")
     with pytest.raises(TrackingError, match=r"the artifacts of runs lie in .*artifacts, as their experiment"):
         open_store(uri, experiment="other", artifacts="elsewhere", wait_s=60.0)

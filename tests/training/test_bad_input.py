@@ -1,4 +1,4 @@
-"""Wrong arguments of what a run is made from."""
+"""Arbitrary arguments of the objects that a run is made from."""
 
 import pytest
 from hypothesis import given
@@ -31,7 +31,7 @@ def test_solved_criterion_with_junk(changed, value):
 @SETTINGS
 @given(value=junk)
 def test_phantom_data_with_junk(changed, value, phantom, monkeypatch):
-    """The phantoms themselves are left out: thousands of them may have been asked for."""
+    """No phantoms are made: thousands may have been asked for."""
 
     def load(seeds, folder, version):
         assert seeds[-1] < 2**31

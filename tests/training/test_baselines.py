@@ -1,4 +1,4 @@
-"""The baselines of an evaluation: which there are, that they are kept, and when they are played again."""
+"""The baselines of an evaluation: which there are, and when their episodes are cached or played again."""
 
 import pytest
 
@@ -15,7 +15,7 @@ def volumes():
 
 @pytest.fixture
 def played(monkeypatch, tmp_path):
-    """Return the agents whose episodes are played, and not taken from an empty cache."""
+    """Return the agents whose episodes are played instead of taken from the cache, which is empty at first."""
     monkeypatch.setenv("ARMSCAN_CACHE", str(tmp_path))
     agents, play = [], baselines.evaluate
 

@@ -23,7 +23,7 @@ class Still:
 
 
 class Oracle:
-    """Knows the optimal plane: begins the episode of a seed, of an evaluation from `first_seed` on, beforehand."""
+    """Knows the optimal plane: first resets the environment to the episode of a seed, counted from `first_seed`."""
 
     def __init__(self, env, first_seed):
         self._env, self._first_seed = env.unwrapped, first_seed

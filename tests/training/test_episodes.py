@@ -1,4 +1,4 @@
-"""Episodes side by side are those that are played one by one, to the bit."""
+"""Episodes played side by side are bit-identical to those played one by one."""
 
 from functools import partial
 
@@ -84,7 +84,7 @@ def test_episodes_side_by_side_are_those_that_are_played_one_by_one(case, datase
 def test_more_episodes_than_side_by_side_are_played_in_turn(dataset, monkeypatch):
     agent, env = made(Random(), VECTOR, dataset), VECTOR.make_env(dataset)
     alone = one_by_one(agent, env, 8, 0)
-    # Of different lengths, or no episode would be left out while others go on.
+    # Of different lengths, so that some episodes end while others go on.
     assert len({episode.n_steps for episode in alone}) > 1
     monkeypatch.setattr("armscan.training.episodes.MAX_SIDE_BY_SIDE", 3)
     assert evaluate(agent, env, n_episodes=8, seed=0).episodes == alone

@@ -52,7 +52,7 @@ def test_verdict_follows_the_interval_of_the_difference(rates, random_rates, ver
 
 
 def test_difference_that_is_the_same_on_all_volumes_has_an_interval_for_other_episodes():
-    # Newcombe (1998) has it of 56 of 70 and 48 of 80: 0.0524 to 0.3339.
+    # Newcombe (1998) gives it for 56 of 70 and 48 of 80: 0.0524 to 0.3339.
     found = difference_of_rates(wilson(56, 70), wilson(48, 80))
     assert found == pytest.approx((0.2, 0.0524, 0.3339), abs=1e-4)
     ours, random = evaluation([0.9, 0.9]), evaluation([0.8, 0.8])

@@ -1,4 +1,4 @@
-"""The table of results: its figures recomputed by the test, its names, and how it fits what it is written to."""
+"""The table of results: its figures recomputed by the test, its names, and how it fits its output."""
 
 import dataclasses
 import html.parser
@@ -175,5 +175,5 @@ def test_jobs_keep_the_leading_figures_at_80_columns_and_their_words_stand_below
     for heading in ("on plane", "distance mm", "angle °", "success", "steps"):
         assert heading in head
     assert f"1: 91c0aaaa, {words[1]}" in lines
-    # Where there is room, they are columns.
+    # If there is room, they are columns.
     assert "1: " not in text_of(table.lines(200), 200)

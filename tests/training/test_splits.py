@@ -1,6 +1,7 @@
 """Training, validation and test volumes."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -43,11 +44,11 @@ def test_phantom_data_refuses_impossible_numbers(changes):
 
 
 @pytest.fixture
-def folder(write_labelmap, tmp_path):
-    """Six volumes of four subjects."""
+def folder(write_labelmap, tmp_path, tiny_volume):
+    """Six volumes of four subjects, no two alike."""
     volumes = {f"{name}.nrrd": {"subject": subject} for name, subject in zip("abcdef", "SSTTUV", strict=True)}
-    for name in volumes:
-        write_labelmap(name)
+    for number, name in enumerate(volumes):
+        write_labelmap(name, np.roll(tiny_volume.labels, number, axis=0))
 
     def write(**manifest):
         (tmp_path / "manifest.json").write_text(json.dumps({"volumes": volumes} | manifest))
@@ -105,7 +106,7 @@ def test_nifti_data_draws_the_shares_by_its_seed(folder):
     ],
 )
 def test_nifti_data_takes_names_of_subjects_and_volumes(folder, validation, test, expected):
-    # What is given goes before what the manifest says.
+    # Arguments take precedence over the manifest.
     path = folder(splits={"train": ["S", "V"], "validation": ["T"], "test": ["U"]})
     if isinstance(expected, tuple):
         assert names(nifti_data(path, validation, test)) == expected
@@ -163,6 +164,14 @@ def test_split_refuses_what_are_no_volumes(tiny_volume, volumes):
         Split({"a": tiny_volume}, volumes, {"b": tiny_volume})
 
 
+def test_split_refuses_a_copy_of_a_volume_in_another_part(tiny_volume):
+    other = replace(tiny_volume, labels=np.roll(tiny_volume.labels, 1, axis=0))
+    with pytest.raises(
+        InvalidValueError, match=r"c \(test\) is a copy of a \(training\), but a wrist must be in one split"
+    ):
+        Split({"a": tiny_volume, "b": replace(tiny_volume)}, {"d": other}, {"c": replace(tiny_volume)})
+
+
 def test_split_refuses_a_volume_in_two_parts(tiny_volume):
     with pytest.raises(InvalidValueError, match="a is in training and in test"):
         Split({"a": tiny_volume}, {"b": tiny_volume}, {"a": tiny_volume})
@@ -178,7 +187,7 @@ def test_split_refuses_a_volume_in_two_parts(tiny_volume):
     ],
 )
 def test_a_fold_is_tested_on_and_the_next_one_chooses_the_checkpoint(folder, changes, expected):
-    # The splits of the manifest have no part in it.
+    # The splits of the manifest are ignored.
     path = folder(splits={"train": ["S", "V"], "validation": ["T"], "test": ["U"]})
     assert names(nifti_data(path, **changes)) == expected
 

@@ -168,7 +168,7 @@ class Killed(BaseException):
 
 
 def cut_off(folder, monkeypatch, n_writes):
-    """Train until so many checkpoints were written, then kill the process."""
+    """Train until `n_writes` checkpoints are written; the next write raises `Killed`."""
     save, written = checkpoints.save_checkpoint, []
 
     def save_or_die(*arguments):
@@ -186,7 +186,7 @@ def cut_off(folder, monkeypatch, n_writes):
 
 
 def gone_on(folder):
-    """Go on with a training; return its callback and its result."""
+    """Resume a training; return its callback and its result."""
     learner, recorder = ScriptedLearner(), Recorder()
     earlier = resume_from_checkpoint(learner, folder, PROVENANCE)
     script = iter(SCRIPT[len(earlier) :])
@@ -309,7 +309,7 @@ def test_training_that_ends_early_goes_on_in_another_folder_as_its_own(tmp_path)
     kept = {file.name: file.read_bytes() for file in first.iterdir()}
     learner = ScriptedLearner()
     reports = take_over_checkpoints(learner, first, second, theirs=theirs, own=own)
-    # Killed here, it is resumed from its own.
+    # If it is killed here, it is resumed from its own checkpoints.
     learner = ScriptedLearner()
     assert resume_from_checkpoint(learner, second, own) == reports
     assert (learner.n_env_steps, [report.n_env_steps for report in reports]) == (90, [50, 90])

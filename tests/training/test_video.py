@@ -21,7 +21,7 @@ def test_video_has_a_frame_for_the_start_and_for_every_step(phantom, tmp_path):
     env = make_armscan_env([phantom], max_steps=3, render_mode="rgb_array")
     record_episode(Still(), env, tmp_path / "episode.gif", seed=0)
     with Image.open(tmp_path / "episode.gif") as video:
-        # The last two pictures show the same plane, but another step.
+        # The last two frames show the same plane, but different steps.
         assert video.n_frames == 4
         assert video.size == (860, 512)
 
@@ -35,7 +35,7 @@ def test_pictures_are_written_as_they_come_and_not_kept(tmp_path):
             pictures.append(weakref.ref(picture))
             video.add(picture)
             sizes.append((tmp_path / "a.gif").stat().st_size)
-            # The one that is added, and the one before.
+            # The one just added, and the one before.
             del picture
             assert sum(each() is not None for each in pictures) <= 2
     assert sizes[5] > 0

@@ -1,4 +1,4 @@
-"""Artifacts of a study that a stranger has made: what they name, and what they are."""
+"""Artifacts of a study made by somebody else: which files they name, and how they are served."""
 
 import base64
 import http.client
@@ -19,7 +19,7 @@ PATHS = ["../{}", "..%2f{}", "%2e%2e/{}", "a/../../{}", "/{}", "..\\{}", "{}%00"
 
 @pytest.fixture(scope="module")
 def dashboard(tmp_path_factory):
-    """Return a dashboard, with a file beside its artifacts; return its address, the storage and the folder."""
+    """Start a dashboard with a file beside its artifacts; return its address, a study and the folder."""
     folder = tmp_path_factory.mktemp("dashboard")
     storage = open_storage(str(folder / "optuna.journal"))
     study = optuna.create_study(study_name="theirs", storage=storage.optuna)
@@ -31,7 +31,7 @@ def dashboard(tmp_path_factory):
 
 
 def answer_to(address, method, path):
-    """Ask for a path as it is written, where other clients would remove the dots; return status and body."""
+    """Request a path exactly as written (other clients would remove the dots); return status and body."""
     connection = http.client.HTTPConnection(HOST, urlsplit(address).port)
     connection.request(method, path, headers={"Content-Type": "application/json"})
     answer = connection.getresponse()

@@ -30,11 +30,11 @@ class Store:
 
 @pytest.fixture
 def dashboard(tmp_path):
-    """Make a study with such attributes; return what the dashboard answers of it."""
+    """Return a function that makes a study with these attributes and returns it as the dashboard lists and shows it."""
 
     def made(of_study, of_trial, *, is_running=False):
         storage = open_storage(str(tmp_path / "optuna.journal"))
-        # As other programs write.
+        # Other programs may write attributes of any type.
         storage.optuna.checks_reads = False
         study = optuna.create_study(study_name="a", storage=storage.optuna)
         for name, value in of_study.items():
@@ -95,7 +95,7 @@ def test_studies_of_others_are_shown_as_they_are(dashboard):
 
 
 def fail_trial(storage, tmp_path, trial):
-    """Press the button that fails a trial; return how the trial stands then."""
+    """Press the button that fails a trial; return the trial afterwards."""
     port, _ = free_ports()
     address = start_dashboard(storage, tmp_path, port)
     told = urllib.request.Request(

@@ -1,4 +1,4 @@
-"""Requests that web pages of others send to the dashboard."""
+"""Requests that other web pages send to the dashboard."""
 
 import http.client
 import json
@@ -28,7 +28,7 @@ FOREIGN = [
 
 @pytest.fixture(scope="module")
 def dashboard(tmp_path_factory):
-    """Return a dashboard with one study; return its address and the storage."""
+    """Start a dashboard with one study; return its address and the storage."""
     folder = tmp_path_factory.mktemp("dashboard")
     storage = open_storage(str(folder / "optuna.journal"))
     optuna.create_study(study_name="mine", storage=storage.optuna)
@@ -59,7 +59,7 @@ def test_no_page_of_others_deletes_or_makes_studies(dashboard, headers):
     requests = [("DELETE", f"/api/studies/{study._study_id}", None), ("POST", "/api/studies", new)]
     requests += [("POST", f"/api/studies/{study._study_id}/rename", b"study_name=theirs")]
     for method, path, body in requests:
-        # As a form sends it, which needs no permission of the server.
+        # The content type of a form, which needs no CORS preflight.
         assert status_of(address, method, path, {"Content-Type": "text/plain"} | headers, body) == 403, path
     assert [each.study_name for each in storage.get_all_studies()] == ["mine"]
 

@@ -1,4 +1,4 @@
-"""The page of MLflow that `armscan ui` names, as a server answers."""
+"""The page of MLflow that `armscan ui` prints, by what the server answers."""
 
 import json
 from http.server import BaseHTTPRequestHandler, HTTPServer
@@ -14,7 +14,7 @@ VIEW = {"key": VIEW_TAG, "value": "{}"}
 
 @pytest.fixture
 def server():
-    """Start a server that answers searches of experiments and of runs; return its address."""
+    """Yield a function that starts a server which answers searches of experiments and runs; it returns the address."""
     started = []
 
     def start(experiments, runs, status=200):

@@ -1,4 +1,4 @@
-"""MLflow's UI and Optuna's dashboard as a person opens them: started, looked at in a browser, ended in every way."""
+"""`armscan ui` as a person uses it: started, looked at in a browser, ended in every way."""
 
 import json
 import os
@@ -40,11 +40,11 @@ PORT_OPTIONS = ("--mlflow-port", "--dashboard-port")
 
 
 def free_ports(n=2):
-    folder_lock = [socket.socket() for _ in range(n)]
-    for each in folder_lock:
+    sockets = [socket.socket() for _ in range(n)]
+    for each in sockets:
         each.bind((HOST, 0))
-    ports = [each.getsockname()[1] for each in folder_lock]
-    for each in folder_lock:
+    ports = [each.getsockname()[1] for each in sockets]
+    for each in sockets:
         each.close()
     return ports
 
@@ -79,7 +79,7 @@ def wait_for(moment, timeout_s=END_S):
 
 
 class Look:
-    """The command as a person starts it, with ports of its own; ready when it says how it is ended."""
+    """The command as a person starts it, with ports of its own; ready when it says how to end it."""
 
     def __init__(self, folder, *words, **environment):
         self.folder, self.file = folder, folder / "printed"
@@ -290,7 +290,7 @@ def test_dashboard_shows_trials_that_come_later(tmp_path, look, storage, study_i
 
 
 def test_ui_leaves_runs_to_the_server_that_keeps_them(both, look):
-    # Told by a word; what the environment says beside it is the password.
+    # The server is named on the command line; the environment holds its password.
     looked = look(both, "--tracking=http://127.0.0.1:1", MLFLOW_TRACKING_PASSWORD=PASSWORD)
     assert looked.printed.splitlines() == [
         "starting  Optuna's dashboard, which takes some seconds",
@@ -357,7 +357,7 @@ def test_ui_shows_a_study_in_the_browser(small_study, look, browser):
     # The figures of its seed, and no row of JSON.
     browser.find("td", text="steps, mean")
     assert not browser.has("td", text="lease")
-    # To its run, at the port of this MLflow.
+    # The link leads to its run, at the port of this MLflow.
     browser.open(browser.find("a", text="its run in MLflow").get_attribute("href"))
     browser.find("h1, h2, h3", text="small-0001")
     assert browser.address.startswith(f"{looked.mlflow}/#/")
@@ -366,7 +366,7 @@ def test_ui_shows_a_study_in_the_browser(small_study, look, browser):
     (page,) = [line.split()[1] for line in looked.printed.splitlines() if line.startswith("runs ")]
     browser.open(page)
     browser.find("a", text="study small")
-    # Of the saved view, with the metrics of the best trial.
+    # A column of the saved view, with a metric of the best trial.
     browser.find("[col-id='metrics.`validation/on_plane_5mm_10deg`']")
     assert not browser.has("a", text="small-0001")
     # The button that shows the children of a run.

@@ -28,7 +28,7 @@ CALLEE = "from armscan.utils.compilation import cached_njit\n\n\n@cached_njit()\
 
 @pytest.fixture
 def called(tmp_path):
-    """Write what a compiled function of another file returns; return what its compiled caller returns, and its hits."""
+    """Return a function that sets what a compiled callee returns; it returns its compiled caller's result and hits."""
     package = tmp_path / "armscan"
     shutil.copytree(PACKAGE / "utils", package / "utils", ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("__init__.py", "errors.py"):
@@ -74,7 +74,7 @@ def test_the_cache_of_a_compiled_function_is_written_by_one_process_at_a_time(mo
     saved = []
 
     def save(self, key, data):
-        # As another process would.
+        # Another process cannot take the lock either.
         with pytest.raises(Timeout):
             FileLock(Path(self._index_path).with_name(LOCK_FILE), timeout=0).acquire()
         saved.append(key)

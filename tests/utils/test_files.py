@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all, and folders that one process holds."""
+"""Files that are written whole or not at all, and folders locked by one process."""
 
 import errno
 import subprocess
@@ -97,7 +97,7 @@ def test_error_of_a_full_disk_names_the_file(tmp_path, is_hidden):
 
     def write(file):
         if is_hidden:
-            # As libraries do that write an archive's end to a full disk.
+            # As libraries do when they write the end of an archive to a full disk.
             raise RuntimeError("unexpected pos") from full
         raise full
 

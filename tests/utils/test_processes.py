@@ -23,7 +23,7 @@ def test_child_runs_its_function_and_collects_garbage_rarely():
 
 def test_child_whose_parent_ended_while_it_imported_is_told_so():
     told = threading.Event()
-    # Nobody's parent any more: the first process of the machine may have adopted this one.
+    # Not this process's parent, as if that had ended and another process had adopted this one.
     on_parent_exit(os.getppid() + 1, told.set)
     assert told.wait(10.0)
 

@@ -1,4 +1,4 @@
-"""YAML of strangers."""
+"""Untrusted YAML."""
 
 import pytest
 import yaml

@@ -1,4 +1,4 @@
-"""Damaged files and odd arguments are read as a volume, or refused by one of the project's own exceptions."""
+"""Damaged files and odd arguments are read as a volume, or refused with one of the project's own exceptions."""
 
 import json
 
@@ -67,7 +67,7 @@ def is_sound(volume):
 
 @pytest.fixture(scope="module")
 def whole_files(tmp_path_factory):
-    """One file of each kind, by name, with its bytes."""
+    """Return the bytes of one whole file of each kind, by name."""
     import SimpleITK
 
     folder, volume = tmp_path_factory.mktemp("whole"), make_tiny_volume()
@@ -96,7 +96,7 @@ def test_truncated_files_are_refused(tmp_path, whole_files, name, kept):
     if name == "wrist.raw":
         path = laid_out(tmp_path, whole_files | {name: path.read_bytes()}, "wrist.mhd", whole_files["wrist.mhd"])
     volume = refuses(lambda: read_volume(path))
-    # All voxels may be there where only the end of a compressed stream, or of a header, is gone.
+    # All voxels may be there if only the end of a compressed stream, or of a header, is missing.
     if volume is not None:
         np.testing.assert_array_equal(volume.labels, make_tiny_volume().labels)
 
@@ -106,7 +106,7 @@ def test_truncated_files_are_refused(tmp_path, whole_files, name, kept):
 @given(data=st.data())
 def test_files_with_flipped_bits_are_read_or_refused(tmp_path, whole_files, name, data):
     damaged = bytearray(whole_files[name])
-    # Mostly in the header, where it does most.
+    # Mostly in the header, where a change matters most.
     for _ in range(data.draw(st.integers(1, 3))):
         position = data.draw(st.integers(0, min(len(damaged), 700) - 1) | st.integers(0, len(damaged) - 1))
         damaged[position] ^= 1 << data.draw(st.integers(0, 7))

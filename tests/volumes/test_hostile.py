@@ -1,4 +1,4 @@
-"""Files that were made to harm: refused at once, in one line, with little memory."""
+"""Malicious files: refused at once, in one line, with little memory."""
 
 import gzip
 import json
@@ -15,7 +15,7 @@ from armscan.volumes import LabelVolume, open_dataset, read_volume
 from tests.conftest import make_tiny_volume
 
 HUGE = 1600
-# Of processor time, generously: what is refused late takes half a minute and more, or all memory.
+# Processor time, set generously: a late refusal takes half a minute or more, or all memory.
 MAX_SECONDS, MAX_BYTES = 15.0, 16 << 20
 MHA = (
     "ObjectType = Image\nNDims = 3\nBinaryData = True\nBinaryDataByteOrderMSB = False\nCompressedData = {compressed}\n"
@@ -53,12 +53,12 @@ def nrrd(n, voxels=b"", *, encoding="raw", more=""):
 
 @pytest.fixture
 def refusal(tmp_path, capfd):
-    """Return the one line in which a file is refused, quickly, with little memory, and with nothing printed beside."""
+    """Return a function that reads a file and returns the line that refuses it, quickly and with little memory."""
 
     def refused(name, contents, beside=()):
         for other, others in {**dict(beside), name: contents}.items():
             (tmp_path / other).write_bytes(others)
-        # Loaded before the clock runs.
+        # Imported before the clock starts.
         import SimpleITK  # noqa: F401
 
         tracemalloc.start()
@@ -91,7 +91,7 @@ DECLARED = {
 
 @pytest.mark.parametrize("name", DECLARED)
 def test_a_small_file_that_declares_a_large_image_is_refused_at_once(refusal, name):
-    # In NIfTI with the header before them.
+    # For NIfTI including the header.
     assert str(HUGE**3 + 352 * (".nii" in name)) in refusal(name, DECLARED[name], {"a.raw": SMALL})
 
 

@@ -12,7 +12,7 @@ TINY_VALUES = {1: 10, 2: 20, 3: 30}
 
 
 def numbered(labels, values, dtype=np.int32):
-    """Return the labels 1, 2, 3 under other numbers."""
+    """Return the labels 1, 2, 3 stored as other values."""
     stored = np.zeros(labels.shape, dtype)
     for label, value in values.items():
         stored[labels == label] = value

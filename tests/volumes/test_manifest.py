@@ -1,4 +1,4 @@
-"""Manifests: what may stand in them, what is refused, and how planes are written into them."""
+"""Manifests: what they may contain, what is refused, and how planes are written into them."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""Volumes in files that processes map: found again as they were, or not at all."""
+"""Volumes in memory-mapped files: found again as they were written, or not at all."""
 
 import errno
 import os
@@ -19,7 +19,7 @@ from tests.conftest import make_tiny_volume
 
 ABOUT = {"orientation": "LPS", "found": [1, "bones"]}
 TURNED = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-# Makes a volume, but is killed where its file is half written.
+# Makes a volume, but is killed while its file is half written.
 KILLED = """
 import os, signal, sys
 from pathlib import Path
@@ -113,7 +113,7 @@ def test_process_that_is_killed_while_writing_leaves_nothing_under_the_name(path
     (left,) = path.parent.glob(".*unfinished")
     assert not path.exists()
     assert_same(mapped_volume(path, lambda: (volume, ABOUT))[0], volume)
-    # Another process may be at work on a young one.
+    # Another process may still be writing a recent one.
     assert left.exists()
     os.utime(left, (0, 0))
     mapped_volume(path.with_name("other.volume"), lambda: (volume, ABOUT))
@@ -147,7 +147,7 @@ def test_those_that_nobody_has_opened_for_longest_make_way(path, kept, volume, m
     monkeypatch.setenv("ARMSCAN_CACHE_GIB", "0")
     mapped_volume(paths[1], lambda: (volume, ABOUT))
     assert [each.exists() for each in (*paths, path)] == [False, True, False, False]
-    # What is mapped stays.
+    # A removed file that is still mapped stays readable.
     assert_same(opened, volume)
 
 

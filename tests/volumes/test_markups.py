@@ -31,7 +31,7 @@ def strict(**properties):
 
 
 TEXT, FLAG = {"type": "string"}, {"type": "boolean"}
-# What markups-schema-v1.0.3.json of 3D Slicer allows in the keys that are written, and no other keys.
+# What 3D Slicer's markups-schema-v1.0.3.json allows for the keys that armscan writes, and no other keys.
 PLANE = strict(
     type={"enum": ["Plane"]},
     name=TEXT,
@@ -84,7 +84,7 @@ def written(folder, volume=TINY, action=ACTION):
 
 
 def rewritten(folder, change, volume=TINY, action=ACTION):
-    """Return the file as another program or person may have left it: `change` works on its markup."""
+    """Return the file as another program or person may have left it: `change` edits its markup."""
     path, document = written(folder, volume, action)
     change(document["markups"][0])
     path.write_text(json.dumps(document))
@@ -110,7 +110,7 @@ def in_ras(markup):
 
 
 def with_points(*offsets):
-    """Control points at such places (x axis, y axis) of the rectangle, instead of its centre and normal."""
+    """Return a change that replaces centre and normal by control points at these (x, y) in the rectangle's frame."""
 
     def change(markup):
         base = np.reshape(markup["baseToNode"], (4, 4))
@@ -169,7 +169,7 @@ def test_markup_is_read_back_as_the_plane_it_was_written_from(tmp_path, volume, 
         as_slicer_saves_it,
     ],
 )
-# Inside, because what only touches a corner of the volume may miss it by a rounding.
+# Inside, because a plane that only touches a corner of the volume may miss it by a rounding error.
 @given(volume=volumes(), action=actions(within=inside))
 @settings(max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_markup_is_read_in_every_notation_of_the_plane(tmp_path, change, volume, action):

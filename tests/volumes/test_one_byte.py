@@ -1,6 +1,6 @@
 """One changed byte anywhere in any file: refused in one line, or the same voxels.
 
-Two kinds of bytes are covered by no sum, and say something else when they are changed, which nobody can tell:
+Two kinds of bytes have no checksum, so a change to them cannot be detected:
 
 - A voxel that is not compressed: only this voxel may change.
 - A header that is not compressed: where the image lies in the world, and its spacing, are what the changed header says.
@@ -19,7 +19,7 @@ from tests.volumes.test_damaged import refuses
 from tests.volumes.test_segmentation import NAMES, write_segmentation
 
 SETTINGS = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-# By the folder that they are written in: file to read, and file to damage where it is another one.
+# By key, each with a folder of its own: the file to read, and in DAMAGED the file to damage if it is another one.
 PLAIN = {"nii": "wrist.nii", "nrrd": "wrist.nrrd", "mha": "wrist.mha", "mhd": "wrist.mhd", "raw": "wrist.mhd"}
 COMPRESSED = {"nii.gz": "wrist.nii.gz", "nrrd.gz": "wrist.nrrd", "mha.z": "wrist.mha", "zraw": "wrist.mhd"}
 SEGMENTATIONS = {"seg": "wrist.seg.nrrd", "layers": "layers.seg.nrrd"}
@@ -30,7 +30,7 @@ N_VOXEL_BYTES = make_tiny_volume().labels.size * 2
 
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory):
-    """Folders with one whole file each, by what it shows."""
+    """Return a folder with one whole file for each key of `FILES`."""
     import SimpleITK
 
     labels = make_tiny_volume().labels
@@ -51,7 +51,7 @@ def stored(tmp_path_factory):
 
 
 def read_with(folder, name, damaged_name, damaged):
-    """Read a file of a folder while one of its files has other contents; None where it is refused, in one line."""
+    """Read a file of a folder while one of its files is damaged; return None if it is refused, in one line."""
     whole = (folder / damaged_name).read_bytes()
     (folder / damaged_name).write_bytes(damaged)
     try:
@@ -82,7 +82,7 @@ def check_byte(folder, key, position, value):
 @given(data=st.data(), value=st.integers(0, 255))
 def test_one_changed_byte_is_refused_or_changes_no_other_voxel(stored, capfd, key, data, value):
     n_bytes = (stored[key] / DAMAGED.get(key, FILES[key])).stat().st_size
-    # Mostly in the header, where it does most.
+    # Mostly in the header, where a change matters most.
     position = data.draw(st.integers(0, min(n_bytes, 700) - 1) | st.integers(0, n_bytes - 1))
     check_byte(stored[key], key, position, value)
     assert capfd.readouterr() == ("", "")

@@ -20,7 +20,7 @@ SHAPE, SPACING = (5, 6, 7), np.array([0.5, 0.75, 1.25])
 
 
 def block():
-    """Every voxel another number, so that it is found again; `labels_of` gives the labels."""
+    """Return a block of numbered voxels; `labels_of` turns the numbers into labels."""
     return np.arange(np.prod(SHAPE), dtype=np.int64).reshape(SHAPE)
 
 
@@ -47,7 +47,7 @@ def written(folder, direction, origin, name="turned.nrrd"):
 
 
 def assert_subset(part, whole):
-    """Every voxel of the part has its place, and its label, in the whole."""
+    """Assert that the whole has every voxel of the part, at the same position and with the same label."""
     distances = np.linalg.norm(part[0][:, None] - whole[0][None], axis=2)
     nearest = distances.argmin(axis=1)
     assert distances[np.arange(len(nearest)), nearest].max() < 1e-4

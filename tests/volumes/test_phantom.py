@@ -28,7 +28,7 @@ def version(request):
 
 
 def ends_of_rows(draw, seed):
-    """Return the end of the distal row and the begin of the next bone, in mm along the arm from the labelled plane."""
+    """Return where the distal row ends and the next bones begin, in mm along the arm from the labelled plane."""
     bones = [tube for tube in draw(np.random.default_rng(seed)) if tube.label == 1]
     spans = [(tube.nodes[0, Y], tube.nodes[-1, Y]) for tube in bones]
     return max(high for low, high in spans if low < 0 < high), min(low for low, _ in spans if low > 0)
@@ -59,7 +59,7 @@ def test_phantoms_of_version_2_differ_in_where_the_labelled_plane_cuts_the_carpu
     varied = np.array([ends_of_rows(draw_varied_wrist, seed) for seed in range(60)])
     assert (np.ptp(usual, axis=0) < 4.0).all()
     assert (np.ptp(varied, axis=0) > 8.0).all()
-    # Rows end nearer to the plane than in version 1 and about where they do there; in some wrists they overlap.
+    # Some rows end nearer to the plane than any in version 1, others about where they do there; some rows overlap.
     assert varied[:, 0].min() < usual[:, 0].min() - 4.0
     assert varied[:, 0].max() > usual[:, 0].min()
     assert (varied[:, 1] < varied[:, 0]).any()
@@ -74,7 +74,7 @@ def test_tendons_of_version_2_are_in_three_groups_on_both_sides_of_the_plane():
         ends = np.array([(tube.nodes[0, Y], tube.nodes[-1, Y]) for tube in inside])
         assert (np.abs(ends) > 7.0).all()
         np.testing.assert_allclose(ends.sum(axis=1), 0.0, atol=1e-9)
-        # Where a piece is missing, nothing reaches the ends of the groups from beyond.
+        # If a piece is missing, there is a gap after the end of the groups.
         n_pieces.add(min(tube.nodes[0, Y] for tube in tendons if tube.nodes[0, Y] > 0) - ends[0, 1] > 0.3)
     assert n_pieces == {True, False}
 

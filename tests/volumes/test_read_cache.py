@@ -14,7 +14,7 @@ PLANE = {"rotation": [1.5, -0.5], "translation": [0.0, 7.0]}
 
 @pytest.fixture
 def n_read(monkeypatch, tmp_path):
-    """Count files that are read, with a cache of its own."""
+    """Give the test a cache of its own; return a function that counts the files read so far."""
     read, counted = reading.read_stored, []
     monkeypatch.setenv("ARMSCAN_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(reading, "read_stored", lambda *a, **k: counted.append(a) or read(*a, **k))
@@ -72,7 +72,7 @@ def test_file_is_read_anew_where_it_has_changed(write_labelmap, write_manifest, 
     write_labelmap("a.nii.gz", labels)
     assert open_dataset(folder).volumes["a.nii.gz"].labels[0, 0, 0] == 4
     assert n_read() == 2
-    # The same voxels, compressed otherwise.
+    # The same voxels, compressed differently.
     path.write_bytes(gzip.compress(gzip.decompress(path.read_bytes()), 1))
     open_dataset(folder)
     assert n_read() == 3

@@ -1,4 +1,4 @@
-"""The motions of a volume."""
+"""Rigid motions of a volume."""
 
 import numpy as np
 import pytest

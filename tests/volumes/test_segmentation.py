@@ -13,7 +13,7 @@ from armscan.volumes import LabelMap, open_dataset, read_volume
 # Saved by 3D Slicer; the package carries them for its own tests.
 SLICER_FILES = Path(slicerio.__file__).parent / "data"
 NAMES = ("Bones", "tendons", "ARTERY")
-# Left, posterior, superior: the second axis runs backwards.
+# In LPS: the three axes run towards posterior, inferior and left.
 DIRECTIONS = np.array([[0.0, 0.5, 0.0], [0.0, 0.0, -0.7], [0.9, 0.0, 0.0]])
 
 
@@ -45,9 +45,9 @@ def stored(tmp_path, tiny_volume):
 
 @pytest.fixture
 def layered(tmp_path, tiny_volume):
-    """Return the small block with two bones that overlap, one segment a layer, and a muscle around a tendon."""
+    """Return the small block in four layers: two bones that overlap, and a muscle that overlaps a tendon."""
     labels = tiny_volume.labels
-    first, second, muscle = labels == 1, labels == 1, labels == 2
+    first, second = labels == 1, labels == 1
     first[8:], second[:7] = False, False
     muscle = np.where(np.roll(labels == 2, 3, axis=0), 5, 0).astype(np.uint8)
     rest = np.where(labels > 1, labels, 0)

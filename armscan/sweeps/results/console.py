@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Mapping, Sequence
 
@@ -30,33 +31,34 @@ from armscan.utils.files import RUN_FILE
 
 
 def print_result(opened: OpenedStudy) -> int:
-    """Print the result of a study; return the exit code."""
+    """Print the result of a study; return the exit code, `os.EX_TEMPFAIL` if only the same command is missing."""
     scheduler, settings = opened.search.scheduler, opened.settings
     state = scheduler.state()
     print_sentence(status_line(opened, state))
     if stopped := scheduler.read_stop_request():
         print_sentence(printable(f"the study was stopped {stopped}; the same command resumes it"))
         return 0
-    wrong = scheduler.failure_reason(state)
-    if wrong is None and scheduler.end_reason(state) is None:
-        wrong = (
-            f"all workers have ended, but only {len(state.finished)} of {settings.n_trials} trials have finished: "
-            f"their logs in {opened.folder / 'workers'} say why; the same command resumes the study"
-        )
-    if wrong:
+    if wrong := scheduler.failure_reason(state):
         print(printable(f"error: {wrong}"), file=sys.stderr)
         return 1
+    if scheduler.end_reason(state) is None:
+        unfinished = (
+            f"the workers of this command have ended, but only {len(state.finished)} of {settings.n_trials} trials "
+            f"have finished: their logs in {opened.folder / 'workers'} say why; the same command resumes the study"
+        )
+        print(printable(f"error: {unfinished}"), file=sys.stderr)
+        return os.EX_TEMPFAIL
     if scheduler.termination is not None and (ended := scheduler.termination.reason):
         told = f"the study has ended by itself: {ended}; study.n_trials or study.terminator change that"
         print_sentence(printable(told))
     if settings.constraints and state.finished and not best_trials(scheduler.study, 1):
         print(f"no trial keeps all constraints: {', '.join(map(str, settings.constraints))}")
     _print_best(opened)
-    is_judged = opened.final_eval is None or _print_final_results(opened, opened.final_eval)
+    code = 0 if opened.final_eval is None else _print_final_results(opened, opened.final_eval)
     print_where_to_look(opened.folder, opened.config.tracking.uri, storage=settings.storage)
     _print_replay(opened)
     print(f"report    {armscan_command('report', '--study', settings.name, storage=settings.storage)}")
-    return 0 if is_judged else 1
+    return code
 
 
 def _print_best(opened: OpenedStudy) -> None:
@@ -84,14 +86,15 @@ def _print_replay(opened: OpenedStudy) -> None:
             print(f"replay    {armscan_command('runs', 'reproduce', run_id, tracking=opened.config.tracking.uri)}")
 
 
-def _print_final_results(opened: OpenedStudy, final: FinalEvaluation) -> bool:
-    """Print how a configuration was chosen, and its results on the test volumes; return whether there are any."""
+def _print_final_results(opened: OpenedStudy, final: FinalEvaluation) -> int:
+    """Print how a configuration was chosen, and its results on the test volumes; return the exit code."""
     trials = opened.search.scheduler.study.get_trials(deepcopy=False)
+    unfinished = os.EX_TEMPFAIL
     for phase in opened.finals:
         check_trials(phase.scheduler.study, n_searched=len(trials))
         failed = phase.scheduler.state().failed
         if failed:
-            reason = failed[0].user_attrs.get(FAILURE)
+            unfinished, reason = 1, failed[0].user_attrs.get(FAILURE)
             print(printable(f"error: {len(failed)} trainings of {phase.name} have failed: {reason}"), file=sys.stderr)
     candidates = candidates_of(final)
     if candidates:
@@ -100,11 +103,11 @@ def _print_final_results(opened: OpenedStudy, final: FinalEvaluation) -> bool:
         _print_rows(title, [each.row(objective) for each in candidates])
     judgement = judge(final)
     if judgement is None or judgement.of_chosen is None:
-        reason = "no trial or no final training has finished"
+        code, reason = 1, "no trial or no final training has finished"
         if not final.is_over:
-            reason = "trainings are missing; the same command resumes the study"
+            code, reason = unfinished, "trainings are missing; the same command resumes the study"
         print(f"error: no final evaluation, because {reason}", file=sys.stderr)
-        return False
+        return code
     if judgement.differences:
         _print_rows(judgement.compared, [each.row() for each in judgement.differences])
         print_sentence(HOW)
@@ -112,7 +115,7 @@ def _print_final_results(opened: OpenedStudy, final: FinalEvaluation) -> bool:
     for name, settings in judgement.settings.items():
         print_sentence(f"{name}: {settings or NOTHING_SEARCHED}")
     print_sentence(f"result: {judgement.result}")
-    return True
+    return 0
 
 
 def _print_rows(title: str, rows: Sequence[Mapping[str, str]]) -> None:

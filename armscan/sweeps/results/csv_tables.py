@@ -103,7 +103,7 @@ def _trial_row(trial: FrozenTrial, objectives: Sequence[str]) -> Row:
 
 
 def _ending_rows(trials: Sequence[FrozenTrial]) -> list[Row]:
-    """Return the number of trials that ended in each state, by cause."""
+    """Return how many trials are in each state, and which, by cause."""
     of_ending: dict[tuple[str, str], list[int]] = {}
     for trial in trials:
         cause = ""

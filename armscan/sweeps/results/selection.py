@@ -66,7 +66,7 @@ def objective_of(final: FinalEvaluation) -> str:
 
 
 def candidates_of(final: FinalEvaluation) -> list[Candidate]:
-    """Return the candidates, the chosen one first, then those with the most seeds."""
+    """Return the candidates: the chosen one first, then the others, those with the most seeds first."""
     scores_of, sign = final.scores(), final.sign
     race = final.race(scores_of)
     searched = final.search.get_trials(deepcopy=False)

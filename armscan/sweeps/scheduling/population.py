@@ -117,8 +117,8 @@ class Population:
     def checkpoints_to_keep(self, trials: Sequence[FrozenTrial]) -> set[int]:
         """Return the numbers of the trials from whose last checkpoints a member may still continue.
 
-        A trial is dropped once all members have finished the next generation, or once its own member has, unless the
-        trial is among the best.
+        A checkpoint of one of the best is kept until all members have finished the next generation, any other only
+        until its own member has.
 
         Args:
             trials: All trials of the study.

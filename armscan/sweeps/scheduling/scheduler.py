@@ -195,7 +195,7 @@ class TrialScheduler:
             # Not if this worker was taken for dead, nor if only the reply was lost and another has claimed it since.
             if now.state == TrialState.RUNNING and is_own:
                 (writes or PendingWrites()).write()
-                # Names no process: a worker that dies between claim and lease must not be taken for this one.
+                # Names no process: a worker that dies between its claim and its lease must not be taken for this one.
                 storage.set_trial_user_attr(trial_id, LEASE, {**lease, "started": "", BEAT_S: time.time()})
                 storage.set_trial_state_values(trial_id, TrialState.WAITING)
 

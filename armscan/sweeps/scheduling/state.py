@@ -39,7 +39,7 @@ class StudyState:
         waiting: Requeued trials and enqueued retries.
         failed: Trials that raised, or whose workers died too often.
         retried: Attempts whose worker died, and that were retried.
-        taken: Finished trials taken from other studies, which do not count.
+        taken: Finished trials taken from other studies, which count towards no limit.
     """
 
     finished: tuple[FrozenTrial, ...]

@@ -131,7 +131,7 @@ class Parameter:
 
     @property
     def extremes(self) -> tuple[Value, ...]:
-        """The values to check so that all are allowed: every choice, or both ends of the range."""
+        """The values to check, as all are allowed if these are: every choice, or both ends of the range."""
         drawn: Any = self.distribution
         return tuple(drawn.choices) if isinstance(drawn, CategoricalDistribution) else (drawn.low, drawn.high)
 

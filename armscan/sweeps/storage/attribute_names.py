@@ -4,7 +4,7 @@
 SPACE, FIXED, OBJECTIVES = "space", "fixed_config", "objectives"
 # Every study of armscan has these.
 OF_STUDY = {SPACE, FIXED, OBJECTIVES}
-# Its tracked run, the SHA-256 of its note in the dashboard, and the origins of its initial trials.
+# Its tracked run, the SHA-256 of armscan's own note in the dashboard, and the origins of its initial trials.
 STUDY_RUN, NOTE_SUM, BEGUN_WITH = "mlflow_run", "note_sha256", "begun_with"
 # Why it has ended, and the settings asked for at that time; trials whose failures are ignored.
 TERMINATED, RESET_FAILURES = "terminated", "forgiven"

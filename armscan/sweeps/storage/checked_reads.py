@@ -22,7 +22,7 @@ from armscan.sweeps.storage.attributes import (
 
 
 class CheckedReads(BaseStorage):
-    """Base class, listed before one of Optuna's storages, that checks everything this storage reads."""
+    """Base class, listed before one of Optuna's storages, that checks what that storage reads."""
 
     # False for Optuna's dashboard, which shows attributes of any type.
     checks_reads = True

@@ -64,7 +64,7 @@ class Storage:
             return decide()
 
     def transaction(self, operate: Callable[[], T]) -> T:
-        """Run several reads and writes, in one transaction of a PostgreSQL database, and return their result.
+        """Run several reads and writes, in a PostgreSQL database as one transaction, and return their result.
 
         Args:
             operate: Function that reads and writes; it may be called again, like `decide` of `exclusive`.
@@ -121,7 +121,7 @@ def _lock_file_of(file: Path) -> Path:
 
 
 def _is_there(file: Path) -> bool:
-    """Return whether there is a file; raise `OSError` if there is something else."""
+    """Return whether there is a file; raise `OSError` if something else is there, or the path cannot be read."""
     try:
         if stat.S_ISREG(file.stat().st_mode):
             return True

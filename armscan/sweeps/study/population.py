@@ -64,8 +64,7 @@ def _check(settings: StudySettings, config: DictConfig, sampler: PopulationSampl
     for parameter in settings.space.parameters:
         if parameter.name not in allowed:
             raise InvalidValueError(
-                f"study.space has {parameter.name}, but during a training only this can change: "
-                f"{listed(allowed) if allowed else 'nothing'}"
+                f"study.space has {parameter.name}, but during a training only this can change: {listed(allowed)}"
             )
         if parameter.when:
             raise InvalidValueError(f"study.space.{parameter.name}.when: {WITH} keys that are always searched")

@@ -20,7 +20,7 @@ class ParetoPruner(BasePruner):
 
     The first rung is at `min_resource` steps, and each further one at `reduction_factor` times as many. A trial that
     reaches a rung is compared with all trials that have reached it, and with the final values of those that completed
-    before it. One trial in `reduction_factor` may continue, at least one: a trial is pruned if so many are better.
+    before it. One trial in `reduction_factor` may continue, at least one: a trial is pruned if that many are better.
     Trials are ranked by Pareto front, and within a front by crowding distance, the larger the better (Schmucker et al.
     2021, arXiv:2106.12639; Deb et al. 2002, doi:10.1109/4235.996017). The whole first front always continues.
 

@@ -20,7 +20,8 @@ from armscan.utils.section import Section
 from armscan.utils.validation import MAX_SEED
 
 NAME = re.compile(rf"(?!.*(?:{'|'.join(FINAL_SUFFIXES)})$)\w[\w\-.]{{0,99}}")
-# Distance of the first selection seed and the first judgement seed from the largest search seed; most final seeds.
+# Distances of the first selection seed and the first judgement seed from the largest search seed, and the maximum
+# number of seeds of a configuration in each.
 SELECTION_SEEDS_ABOVE, JUDGEMENT_SEEDS_ABOVE, MAX_FINAL_SEEDS = 1000, 2000, 1000
 MAX_SEARCH_SEED = MAX_SEED - JUDGEMENT_SEEDS_ABOVE - MAX_FINAL_SEEDS
 T = TypeVar("T")

@@ -127,6 +127,9 @@ def _check_same(settings: StudySettings, study: optuna.Study, wanted: Mapping[st
     for key, what in ((SPACE, "searches another space"), (OBJECTIVES, "has other objectives")):
         if differences := _differences(renamed(there.get(key, {})), wanted[key]):
             raise StudyError(f"{whose} {what}: {differences}{other}")
+    # The values of its trials are in this order.
+    if [*there[OBJECTIVES]] != [*wanted[OBJECTIVES]]:
+        raise StudyError(f"{whose} has its objectives in another order: {', '.join(there[OBJECTIVES])}{other}")
     differences = _differences(migrate(there.get(FIXED, {})), wanted[FIXED])
     if differences and not settings.allow_config_changes:
         raise StudyError(

@@ -179,7 +179,8 @@ def _source(settings: StudySettings, name: str, storage: Storage | None) -> optu
 
 def _difference(there: Mapping[str, Any], wanted: Mapping[str, Any]) -> str | None:
     """Return the first difference, except in searched keys, that makes a study's values useless; None without one."""
-    if there[OBJECTIVES] != wanted[OBJECTIVES]:
+    # The values of a trial are in this order.
+    if [*there[OBJECTIVES].items()] != [*wanted[OBJECTIVES].items()]:
         return f"its objectives are {' and '.join(there[OBJECTIVES])}"
     searched = tuple(f"{key}." for key in (*renamed(there[SPACE]), *wanted[SPACE]))
     before, now = migrate(there[FIXED]), wanted[FIXED]

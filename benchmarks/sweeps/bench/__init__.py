@@ -1,1 +1,1 @@
-"""A bench for studies: learning curves that are trained once, and searched many times without training."""
+"""A bench for studies: learning curves are trained once, then searched many times without training."""

@@ -23,7 +23,7 @@ from benchmarks.sweeps.bench.warm_start import SimulatedSweep, replays, share_of
 
 
 def main() -> None:
-    """Run what is asked for."""
+    """Run the command."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.sweeps.bench", description=__doc__.partition("\n")[0])
     commands = parser.add_subparsers(dest="command", required=True)
     collecting = commands.add_parser("collect", help="train what is missing in a table")

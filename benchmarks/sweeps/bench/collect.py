@@ -43,10 +43,10 @@ def collect(
         n_configs: Number of configurations, the default one included.
         n_seeds: Trainings of each, with the seeds from 0.
         workers: Processes that train. Default: 1, this one.
-        allow_changes: Whether to add to a table although other settings than the searched ones have changed since.
-            Default: False.
+        allow_changes: Whether to extend a table although settings that are not searched have changed since. Default:
+            False.
         overrides: Overrides of all trainings, as on the command line. Default: none.
-        file: The table. Default: None, the one of the bench.
+        file: File of the table. Default: None, the one of the bench.
     """
     file = file or table_file(sweep)
     design, rows = Design.of(sweep, n_configs, overrides), read_rows(file)
@@ -155,7 +155,7 @@ class _Recorder:
 
 
 def _shortened(metrics: dict[str, float]) -> dict[str, float]:
-    # Four digits are more than the episodes can tell apart.
+    # The episodes justify no more than four digits.
     return {name: float(f"{metrics[name]:.4g}") for name in METRICS}
 
 

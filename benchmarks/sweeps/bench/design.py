@@ -18,7 +18,7 @@ from armscan.sweeps.space.space import Space
 from armscan.sweeps.tasks.attempt import config_sha256
 from armscan.utils.arrays import FloatArray
 
-# Of the Sobol sequence's scrambling.
+# Seed of the Sobol sequence's scrambling.
 SEED = 0
 
 
@@ -27,10 +27,10 @@ class Design:
     """The configurations of a bench.
 
     Args:
-        sweep: Name of the sweep whose space it is.
-        space: The space.
+        sweep: Name of the sweep.
+        space: Search space of the sweep.
         configs: Values by name of each configuration, the default one first.
-        fixed_sha256: SHA-256 of the configuration that the space is searched in.
+        fixed_sha256: First 12 digits of the SHA-256 of the default configuration.
     """
 
     sweep: str
@@ -40,7 +40,7 @@ class Design:
 
     @classmethod
     def of(cls, sweep: str, n_configs: int, overrides: Sequence[str] = ()) -> Design:
-        """Return the first configurations of a sweep; those of a smaller number are among those of a larger.
+        """Return the first configurations of a sweep; a larger number only appends to them.
 
         Args:
             sweep: Name of the sweep, such as `sac_y`.
@@ -63,7 +63,7 @@ def sobol(n_dimensions: int, n_points: int) -> FloatArray:
 
 
 def values_at(space: Space, places: FloatArray) -> dict[str, Value]:
-    """Return the values of a space by name at a place in each of its dimensions, from 0 to below 1."""
+    """Return the values of a space by name at a point, given by a place from 0 to below 1 in each dimension."""
     return {
         each.name: value_at(each.distribution, float(place))
         for each, place in zip(space.parameters, places, strict=True)
@@ -76,14 +76,14 @@ def default_of(space: Space, config: DictConfig) -> dict[str, Value]:
 
 
 def value_at(distribution: BaseDistribution, place: float) -> Value:
-    """Return the value of a distribution at a place from 0 to below 1, all of them equally likely."""
+    """Return the value of a distribution at a place, its quantile from 0 to below 1."""
     if isinstance(distribution, CategoricalDistribution):
         return distribution.choices[int(place * len(distribution.choices))]
     drawn: Any = distribution
     is_whole = isinstance(drawn, IntDistribution)
     low, high = (drawn.low - 0.5, drawn.high + 0.5) if is_whole else (drawn.low, drawn.high)
     number = math.exp(_between(math.log(low), math.log(high), place)) if drawn.log else _between(low, high, place)
-    # Seven digits are enough, and are the same when read again.
+    # Seven digits, as `write_rows` writes them: read again, they are the same.
     return min(max(round(number), drawn.low), drawn.high) if is_whole else float(f"{number:.7g}")
 
 
@@ -93,7 +93,7 @@ def places_of(space: Space, values: Mapping[str, Value]) -> list[float]:
 
 
 def place_of(distribution: BaseDistribution, value: Any) -> float:
-    """Return where a value lies between the ends of its range, from 0 to 1; of a choice its place among them."""
+    """Return where a value lies in its range, from 0 to 1; for a choice, where it comes in the list of choices."""
     if isinstance(distribution, CategoricalDistribution):
         return distribution.choices.index(value) / max(1, len(distribution.choices) - 1)
     drawn: Any = distribution
@@ -106,5 +106,5 @@ def _between(low: float, high: float, place: float) -> float:
 
 
 def _sha256(config: Mapping[str, Any]) -> str:
-    # Where runs are tracked changes no curve.
+    # Where runs are tracked does not change a curve.
     return config_sha256({key: value for key, value in config.items() if key != "tracking"})[:12]

@@ -1,4 +1,4 @@
-"""Compute importances and effects of the keys of a space, with intervals that draw configurations."""
+"""Compute importances and effects of the keys of a space, with bootstrap intervals over configurations."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from benchmarks.sweeps.bench.design import places_of, sobol, values_at
 from benchmarks.sweeps.bench.surrogate import Surrogate
 from benchmarks.sweeps.bench.table import Curves
 
-# Values of a key, and places of all others that its effect is averaged over, a power of 2.
+# Values of a key, and points of a Sobol sequence over which its effect is averaged, a power of 2.
 N_VALUES, N_PLACES = 9, 32
 
 
@@ -23,11 +23,11 @@ class Key(NamedTuple):
     """Importance and effect of a key.
 
     Args:
-        fanova: Share of the variance between configurations that fANOVA gives it.
-        ped_anova: Share that PED-ANOVA gives it among the best configurations.
-        effect: How many times more mean steps its worst value takes than its best, averaged over the other keys.
+        fanova: Share of the variance between configurations that fANOVA attributes to it.
+        ped_anova: Share of the importance among the best configurations, by PED-ANOVA.
+        effect: Mean steps at its worst value over those at its best, averaged over the other keys.
         places: Places of its values, shape (values,), from 0 to 1.
-        steps: Mean steps at each, with its interval, shape (values, 3).
+        steps: Mean steps at each value with their interval, shape (values, 3).
     """
 
     fanova: Estimate
@@ -38,11 +38,11 @@ class Key(NamedTuple):
 
 
 def keys_of(curves: Curves, n_resamples: int) -> dict[str, Key]:
-    """Return what is known of each key of a table.
+    """Return importance and effect of each key of a table.
 
     Args:
         curves: The table.
-        n_resamples: Resamples of its configurations, which the intervals are over.
+        n_resamples: Number of resamples of its configurations, for the intervals.
     """
     rng, n = np.random.default_rng(0), len(curves.configs)
     drawn = [np.arange(n), *(np.sort(rng.integers(n, size=n)) for _ in range(n_resamples))]
@@ -69,14 +69,14 @@ def effects_of(surrogate: Surrogate) -> dict[str, tuple[FloatArray, FloatArray]]
     effects = {}
     for dimension, parameter in enumerate(space.parameters):
         choices = getattr(parameter.distribution, "choices", ())
-        # In the middle of each part of the range.
+        # The middle of each of equal parts of the range.
         drawn = (np.arange(len(choices) or N_VALUES) + 0.5) / (len(choices) or N_VALUES)
         steps, places = np.empty(len(drawn)), np.empty(len(drawn))
         for number, place in enumerate(drawn):
             varied = points.copy()
             varied[:, dimension] = place
             found = np.array([places_of(space, values_at(space, row)) for row in varied])
-            # The geometric mean: settings that fail would hide all others.
+            # The geometric mean: an arithmetic one would be ruled by settings that fail.
             steps[number], places[number] = np.exp(np.log(surrogate.truth(found)).mean()), found[0, dimension]
         effects[parameter.name] = places, steps
     return effects
@@ -98,5 +98,5 @@ def _importances(curves: Curves) -> dict[str, tuple[float, float]]:
 
 
 def _estimate(values: FloatArray) -> Estimate:
-    """Return the first value, with the interval of the others, which are resamples."""
+    """Return the first value with the 95 % interval of the others, its resamples."""
     return Estimate(float(values[0]), *(float(end) for end in np.nanquantile(values[1:], [0.025, 0.975])))

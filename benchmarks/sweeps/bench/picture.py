@@ -1,4 +1,4 @@
-"""The picture of a bench: samplers and pruners, a race beside fixed seeds, and the effect of each key."""
+"""The picture of a bench: samplers and pruners, races compared with fixed seeds, and the effect of each key."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def draw(ranks: pd.DataFrame, races: Mapping[int, Races], keys: Mapping[str, Key
     Args:
         ranks: Rows of `ranked`.
         races: Fixed seeds and races, by the number of candidates; the last are drawn.
-        keys: Importance and sensitivity of each key.
+        keys: Importance and effect of each key.
         path: The file.
         title: Title of the picture.
     """
@@ -73,7 +73,7 @@ def _draw_races(axes: Axes, fixed: Sequence[Choices], races: Mapping[str, Choice
     axes.set_yscale("log")
     axes.set_title(title)
     axes.grid(alpha=0.3, which="both")
-    # Below, because it would hide the races.
+    # Below the axes, where the legend hides no race.
     axes.legend(fontsize=7, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.12))
 
 

@@ -10,19 +10,19 @@ from armscan.utils.arrays import FloatArray
 from benchmarks.sweeps.bench.surrogate import Surrogate
 
 N_SEEDS = (2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 30, 50)
-# How much more mean steps one of them takes; 0 counts the false alarms.
+# Relative differences in mean steps; 0 gives the false positives.
 DIFFERENCES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
-# Of settings that take at most so many times the steps of the best: nobody compares others.
+# Good settings take at most this multiple of the steps of the best: nobody compares others.
 COMPARED = 2.0
 N_COMPARISONS = 4000
 LEVEL, POWER = 0.05, 0.8
 
 
 def power_of(surrogate: Surrogate, n_comparisons: int = N_COMPARISONS) -> pd.DataFrame:
-    """Return how often a difference is seen, by how large it is (rows) and by seeds of each setting (columns).
+    """Return how often a difference is detected, by its size (rows) and by the seeds of each setting (columns).
 
-    Both settings have the residuals of the table's good configurations in their tests. A difference is seen if Welch's
-    t test of the logarithms of the mean steps says so at 5 %.
+    Both settings draw the test residuals of the table's good configurations. A difference is detected if Welch's t test
+    of the logarithms of the mean steps is significant at 5 %.
     """
     residuals = residuals_of_good_configs(surrogate)
     rng = np.random.default_rng(0)
@@ -37,13 +37,13 @@ def power_of(surrogate: Surrogate, n_comparisons: int = N_COMPARISONS) -> pd.Dat
 
 
 def needed_seeds(power: pd.DataFrame) -> dict[float, int | None]:
-    """Return the fewest seeds with which a difference is seen in four of five comparisons; None if more than all."""
+    """Return the fewest seeds that detect each difference in 80 % of comparisons; None if even the most do not."""
     enough = power >= POWER
     return {float(each): int(row.idxmax()) if row.any() else None for each, row in enough.iterrows() if each > 0}
 
 
 def residuals_of_good_configs(surrogate: Surrogate) -> FloatArray:
-    """Return what the trainings of good configurations are off their means in the test, as logarithms."""
+    """Return the test residuals of the trainings of good configurations, as logarithms."""
     means = surrogate.means[:, -1]
     is_good = means <= means.min() + np.log(COMPARED)
     return surrogate.residuals[is_good[surrogate.config_of], -1]

@@ -1,4 +1,4 @@
-"""Choosing among the best of a search: a race over seeds beside the same number of seeds for all."""
+"""Choosing among the best of a search: a race over seeds, compared with the same number of seeds for all."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from benchmarks.sweeps.bench.surrogate import SimulatedConfig, Surrogate
 
 N_SEEDS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 24)
 FIXED: Mapping[str, SeedRule] = {f"{n_seeds} seeds each": fixed(n_seeds) for n_seeds in N_SEEDS}
-# Seeds of all, and on average; the first is armscan's default.
+# Seeds of all configurations at first, and on average; the first pair is armscan's default.
 ALLOCATIONS = ((2, 6), (2, 4), (3, 6), (2, 8))
 # Fewest and most seeds, and the confidence at which a configuration is dropped.
 T_RACES = ((3, 8, 0.9), (2, 6, 0.8), (5, 10, 0.9), (4, 16, 0.95))
@@ -34,8 +34,8 @@ class Choices(NamedTuple):
     """Choices of a rule, as means over repeated choices.
 
     Args:
-        regret: Mean steps that the chosen candidate truly takes more than the best one on the validation volumes, shape
-            (studies,). A rule can find no more: it does not see the test volumes.
+        regret: True mean steps of the chosen candidate above the best one's, shape (studies,). On the validation
+            volumes, because no rule sees the test volumes.
         n_trainings: Trainings of the choice, shape (studies,).
     """
 
@@ -44,15 +44,15 @@ class Choices(NamedTuple):
 
 
 class Comparison(NamedTuple):
-    """A race beside fixed seeds.
+    """A race compared with fixed seeds.
 
     Args:
         rule: Name of its rule.
         regret: Its mean regret.
         n_trainings: Its mean number of trainings.
         n_fixed: Trainings that fixed seeds need for the same regret; infinite where none of `FIXED` reaches it.
-        share: Share of those that the race needs. Where none of `FIXED` reaches its regret, an upper bound of it: the
-            share of the trainings of the last one.
+        share: Trainings of the race as a share of `n_fixed`. Where none of `FIXED` reaches its regret, an upper bound:
+            the share of the last one's trainings.
     """
 
     rule: str
@@ -71,10 +71,10 @@ def candidates_of(
 
 
 def choices_of(candidates: Sequence[Sequence[SimulatedConfig]], rules: Mapping[str, SeedRule]) -> dict[str, Choices]:
-    """Return what rules choose in each study, all of them of the same simulated trainings.
+    """Return what rules choose in each study, all from the same simulated trainings.
 
     Args:
-        candidates: Configurations of each study, as many in each.
+        candidates: Configurations of each study, the same number in each.
         rules: The rules by their names.
     """
     truths = np.array([[each.selection_truth for each in of_study] for of_study in candidates])
@@ -95,7 +95,7 @@ def choices_of(candidates: Sequence[Sequence[SimulatedConfig]], rules: Mapping[s
 
 
 def compare(fixed: Sequence[Choices], races: Mapping[str, Choices]) -> list[Comparison]:
-    """Return each race beside the fixed seeds that choose as well, with intervals that draw studies.
+    """Compare each race with the fixed seeds that choose as well, with bootstrap intervals over studies.
 
     Args:
         fixed: Choices of the rules of `FIXED`, fewest seeds first.
@@ -120,8 +120,8 @@ def needed_for(regret: float, regrets: FloatArray, n_trainings: FloatArray) -> f
 
     Args:
         regret: The regret to reach.
-        regrets: Regrets of the curve, made to fall only.
-        n_trainings: Trainings of each of them, rising.
+        regrets: Regrets of the curve, of which the running minimum counts.
+        n_trainings: Trainings of each regret, increasing.
     """
     falling = np.minimum.accumulate(regrets)
     reached = falling <= regret
@@ -137,6 +137,6 @@ def needed_for(regret: float, regrets: FloatArray, n_trainings: FloatArray) -> f
 
 
 def _estimate(values: FloatArray) -> Estimate:
-    """Return the first value, with the interval of the others, which are resamples."""
+    """Return the first value with the 95 % interval of the others, its resamples."""
     low, high = np.quantile(values[1:], [0.025, 0.975], method="inverted_cdf")
     return Estimate(float(values[0]), float(low), float(high))

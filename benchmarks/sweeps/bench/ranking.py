@@ -19,10 +19,10 @@ from benchmarks.sweeps.bench.surrogate import SimulatedConfig, Surrogate
 SAMPLERS, PRUNERS = ("random", "tpe", "cmaes", "nsga2"), ("none", "median", "halving")
 # Samplers that are also compared with two seeds a trial.
 TWO_SEEDS = ("random", "tpe")
-# What all are compared with.
+# The rule that all are compared with.
 REFERENCE = Rule("random", "none")
 # Candidates of the final evaluation; seeds of each at first and on average, and whether the control races, too. Rules
-# are ranked without it: chosen in place of bad candidates, it hides what a sampler finds.
+# are ranked without the control: chosen in place of bad candidates, it hides what a sampler finds.
 TOP_K = 3
 FINALS = {"fixed": (5, 5, False), "race": (2, 6, False), "control": (2, 6, True)}
 
@@ -35,7 +35,7 @@ def rules(samplers: Sequence[str] = SAMPLERS) -> Iterator[Rule]:
             to propose a trial.
     """
     whole = itertools.starmap(Rule, itertools.product(samplers, PRUNERS))
-    # Each once, what all are compared with first.
+    # Each rule once, the reference first.
     yield from dict.fromkeys([REFERENCE, *whole, *(Rule(each, "median", 2) for each in TWO_SEEDS if each in samplers)])
 
 
@@ -61,8 +61,8 @@ def studies_of(
         workers: Processes that simulate. Default: 1, this one.
 
     Returns:
-        A row of each study: how many mean steps what it chose is truly worse than the best of the space, by the best
-        value of the search and by each way of the final evaluation, and the trainings of these.
+        A row for each study: the true mean steps of its choice above the best of the space, chosen by the best value of
+        the search and by each of `FINALS`, and the trainings of the latter.
     """
     _, best = surrogate.best()
 
@@ -84,15 +84,15 @@ def studies_of(
 
 
 def ranked(studies: pd.DataFrame, by: str = "race") -> pd.DataFrame:
-    """Return a row of each rule, the best first.
+    """Return a row for each rule, the best first.
 
     Args:
         studies: Rows of `studies_of`.
         by: Column of the regret that they are ranked by. Default: `race`.
 
     Returns:
-        The mean regret with its 95 % interval, and the probability that a study chooses better than one that searches
-        at random without pruning, with its own.
+        The mean regret, and the probability that a study chooses better than one with random search and no pruning,
+        each with its 95 % interval.
     """
     keys = list(vars(REFERENCE))
     columns = ["n_trials", "search", *FINALS, *(f"{name}_trainings" for name in FINALS)]

@@ -21,7 +21,7 @@ from armscan.sweeps.space.parameter import Value
 from armscan.utils.arrays import FloatArray
 from benchmarks.sweeps.bench.surrogate import SimulatedConfig, Surrogate
 
-# Of one study, a sampler that proposes pruned points again and again must not go on for ever.
+# Limits a study: a sampler that keeps proposing points that are pruned must not run for ever.
 MAX_TRIALS_A_TRAINING = 5
 
 
@@ -91,7 +91,7 @@ def search(
 
     Args:
         surrogate: Simulates the trainings.
-        sweep: Name of the sweep, of which the pruner has its settings.
+        sweep: Name of the sweep that sets the options of sampler and pruner.
         rule: How to search.
         n_trainings: The budget; the last trial may exceed it.
         seed: Seed of the sampler, and of the trainings.
@@ -116,7 +116,7 @@ def search(
         else:
             study.tell(trial, value)
             candidates.append(Candidate(value, config, trial.number, float(spent / total), values))
-    # The first of equal ones, as armscan sorts them.
+    # Of equal values, the first stays first, as in armscan.
     candidates.sort(key=lambda each: each.value)
     return Search(tuple(candidates), n_trials, float(spent / total))
 
@@ -131,7 +131,7 @@ def _run(trial: Trial, config: SimulatedConfig, n_seeds: int, rng: np.random.Gen
             trial.report(float(np.mean([*best, steps])), int(seed * total + n_env_steps))
             if trial.should_prune():
                 return None, seed * total + n_env_steps
-        # The fewest steps stand for the best validation: its success rate hardly ever chooses another.
+        # The fewest steps stand for the best validation: success rates hardly ever choose another.
         best.append(float(curve.min()))
     return float(interquartile_mean(np.array(best))), n_seeds * total
 
@@ -142,7 +142,7 @@ class Choice:
 
     Args:
         place: Place of the chosen candidate.
-        n_trainings: Number of its trainings.
+        n_trainings: Number of trainings of all candidates.
     """
 
     place: int
@@ -150,11 +150,11 @@ class Choice:
 
 
 def choose(scores: FloatArray, *, min_seeds: int, mean_seeds: int) -> Choice:
-    """Let candidates race over fresh seeds; with as many seeds on average as at first, all get the same.
+    """Let candidates race over fresh seeds; if `mean_seeds` equals `min_seeds`, all get the same number.
 
     Args:
-        scores: Scores that the trainings would have, shape (candidates, seeds), greater is better; no candidate gets
-            more seeds than these.
+        scores: Scores of all possible trainings, shape (candidates, seeds), greater is better; no candidate gets more
+            seeds than these.
         min_seeds: Seeds of all candidates.
         mean_seeds: Seeds of a candidate on average, at most.
     """
@@ -168,12 +168,12 @@ def choose(scores: FloatArray, *, min_seeds: int, mean_seeds: int) -> Choice:
 
 
 def scores_of(candidates: Sequence[SimulatedConfig], n_seeds: int, rng: np.random.Generator) -> FloatArray:
-    """Return scores of fresh trainings, minus the steps of the selection, shape (candidates, seeds)."""
+    """Return scores of fresh trainings, the negative steps of the selection, shape (candidates, seeds)."""
     return -np.array([each.draw(rng, n_seeds)[:, -2] for each in candidates])
 
 
 def silence() -> None:
-    """Keep Optuna from printing a line for each study and each experimental argument, in this process."""
+    """Silence Optuna's log, and all warnings, in this process."""
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     warnings.simplefilter("ignore")
 

@@ -99,7 +99,7 @@ def _print_table(curves: Curves, surrogate: Surrogate) -> None:
 def _print_power(power: pd.DataFrame) -> None:
     needed = needed_seeds(power)
     rows = [
-        # Rounded down, so that no share reads as enough that is not.
+        # Rounded down, so that no share below 80 % reads as 80 %.
         (f"{difference:.0%}", *(f"{floor(100 * share)}%" for share in row), needed.get(float(difference), "") or "none")
         for difference, row in power.iterrows()
     ]

@@ -1,4 +1,4 @@
-"""Rules of seeds: how many trainings each configuration gets before one is chosen, for many choices at once."""
+"""Seed rules: how many trainings each configuration gets before one is chosen, for many choices at once."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from armscan.utils.arrays import FloatArray
 
 # Seeds that are simulated for each configuration: no rule takes more.
 MAX_SEEDS = 24
-# Confidence of Friedman's test, as irace has it.
+# Confidence of Friedman's test, as in irace.
 FRIEDMAN_LEVEL = 0.95
 Mask = NDArray[np.bool_]
 
@@ -43,7 +43,7 @@ class Chosen(NamedTuple):
 
 # Scores of shape (choices, configurations, seeds), greater is better.
 SeedRule = Callable[[FloatArray], Chosen]
-# Scores of the seeds so far and the configurations that are in, to those that stay in.
+# Maps the scores of the seeds so far, and the configurations that are in, to the configurations that stay in.
 Drop = Callable[[FloatArray, Mask], Mask]
 
 
@@ -53,7 +53,7 @@ def fixed(n_seeds: int) -> SeedRule:
 
 
 def t_race(min_seeds: int, max_seeds: int, level: float) -> SeedRule:
-    """Return the rule that drops after each seed those behind the leader by a one-sided t test.
+    """Return the rule that, after each seed, drops those behind the leader by a one-sided t test.
 
     Args:
         min_seeds: Seeds of all configurations.
@@ -107,7 +107,7 @@ def allocation(min_seeds: int, mean_seeds: int, *, n_at_once: int | None = None,
 
 
 def _raced(scores: FloatArray, *, rounds: Sequence[int], drop: Drop) -> Chosen:
-    """Run rounds with so many seeds until one configuration is left; that with the highest lower end is chosen."""
+    """Run rounds with these seeds until one configuration is left; choose the highest lower end of an interval."""
     is_in, n_seeds = np.ones(scores.shape[:2], bool), np.zeros(scores.shape[:2], np.intp)
     lower = np.zeros(scores.shape[:2])
     for n_now in rounds:
@@ -144,7 +144,7 @@ def _behind_by_t(seen: FloatArray, is_in: Mask, *, level: float) -> Mask:
 
 def _behind_by_ranks(seen: FloatArray, is_in: Mask) -> Mask:
     n_seeds, n_left = seen.shape[-1], is_in.sum(axis=1, keepdims=True)
-    # The best has rank 1; those that are out come last, so that they change no other rank.
+    # The best has rank 1; dropped ones come last, so that they change no other rank.
     ranks = np.where(is_in[..., np.newaxis], rankdata(np.where(is_in[..., np.newaxis], -seen, np.inf), axis=1), 0.0)
     sums, squares = ranks.sum(axis=-1), (ranks**2).sum(axis=(1, 2))[:, np.newaxis]
     with np.errstate(divide="ignore", invalid="ignore"):

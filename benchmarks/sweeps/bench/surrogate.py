@@ -1,12 +1,12 @@
 """Trainings of any configuration, simulated from the table: the mean by a forest, residuals from real trainings.
 
-A table alone has too few points for a sampler to search: mapped to the nearest of them, what samplers propose would be
-spoiled, those most that search locally (Pfisterer et al. 2022, YAHPO Gym). So extremely randomised trees (Geurts et
-al. 2006) over the configurations give weights to those of the table (Meinshausen 2006), and the mean curve of a
-configuration is the weighted mean of theirs; of one in the table it is its own. A training adds the residuals of one
-real training, drawn by the same weights: its differences from the mean of its own configuration, in all epochs, the
-selection and the test at once, so that they are as large, as skewed and as persistent as in the table. All of it is of
-the logarithm of the mean steps of an episode. What a configuration is truly worth is then known: the mean over all
+A table alone has too few points for a sampler to search: replacing each proposal by the nearest of them would handicap
+samplers, most of all those that search locally (Pfisterer et al. 2022, YAHPO Gym). So extremely randomised trees
+(Geurts et al. 2006) weight the configurations of the table (Meinshausen 2006), and the mean curve of a configuration is
+the weighted mean of their curves; a configuration of the table keeps its own. A training adds the residuals of one real
+training, drawn with the same weights: its differences from the mean of its own configuration, in all epochs, the
+selection and the test at once, so that they are as large, as skewed and as persistent as in the table. All of this is
+on the logarithm of the mean steps of an episode. The true value of a configuration is then known: the mean over all
 trainings that could be drawn.
 """
 
@@ -27,7 +27,7 @@ from benchmarks.sweeps.bench.design import places_of, sobol, values_at
 from benchmarks.sweeps.bench.table import Curves
 
 N_TREES, N_FOLDS = 100, 10
-# Places at which the best of the space is looked for, a power of 2.
+# Points among which the best of the space is searched, a power of 2.
 N_PLACES = 2048
 
 
@@ -36,7 +36,8 @@ class Training(NamedTuple):
 
     Args:
         curve: Mean steps in the validation of each epoch, shape (epochs,).
-        selection: Mean steps of the best epoch's weights on the validation volumes, in episodes that chose no weights.
+        selection: Mean steps of the best epoch's weights on the validation volumes, in episodes that did not select
+            weights.
         test: The same on the test volumes.
     """
 
@@ -50,11 +51,11 @@ class Surrogate:
     """A model of the mean steps of an episode in each epoch's validation, and in the selection and the test at the end.
 
     Args:
-        space: The space.
+        space: Search space of the sweep.
         env_steps: Environment steps at the end of each epoch, shape (epochs,).
-        low: Lower corner of the box in the space that each tree puts each configuration in, shape
+        low: Lower corner of the box of each tree's leaf that each configuration is in, shape
             (trees, configurations, dimensions); NaN for a configuration that is left out.
-        high: Its upper corner, likewise.
+        high: Upper corner of that box, likewise.
         share: Inverse of the number of configurations in that box, shape (trees, configurations).
         means: Mean logarithm of each configuration's epochs, selection and test, shape (configurations, epochs + 2).
         residuals: Difference of each training from that mean, shape (trainings, epochs + 2).
@@ -84,7 +85,7 @@ class Surrogate:
         parts = curves.validation, curves.selection, curves.test
         logs = np.log(np.column_stack([part["mean_steps"] for part in parts]))
         means, n_seeds = curves.mean_over_seeds(logs), np.bincount(curves.config_of)[curves.config_of, np.newaxis]
-        # A mean over few seeds has moved towards each of them.
+        # Differences from a mean over few seeds are too small, because each seed has moved that mean.
         residuals = (logs - means[curves.config_of]) * np.sqrt(n_seeds / (n_seeds - 1))
         places = curves.places()
         is_in = np.arange(len(places)) % N_FOLDS != (-1 if without is None else without)
@@ -101,13 +102,13 @@ class Surrogate:
         return cls(curves.space, curves.env_steps, low, high, share, means, residuals, curves.config_of, bounds)
 
     def weights(self, places: FloatArray) -> FloatArray:
-        """Return how much each configuration of the table counts at places, shape (places, configurations)."""
-        # Much quicker than the forest's own method, which takes milliseconds for one place.
+        """Return the weight of each configuration of the table at points, shape (places, configurations)."""
+        # Much faster than the forest's own method, which takes milliseconds for one point.
         are_in = (((place > self.low) & (place <= self.high)).all(axis=-1) for place in places)
         return np.array([(self.share * is_in).sum(axis=0) for is_in in are_in]) / len(self.share)
 
     def config(self, values: Mapping[str, Any]) -> SimulatedConfig:
-        """Return what stands for a configuration, given by its values by name."""
+        """Return the simulation of a configuration, given by its values by name."""
         (weights,) = self.weights(np.array([places_of(self.space, values)]))
         n_seeds = np.bincount(self.config_of)
         return SimulatedConfig(self, weights @ self.means, (weights / n_seeds)[self.config_of])
@@ -120,7 +121,7 @@ class Surrogate:
         return np.asarray((np.exp(logs.clip(*self.bounds)) * drawn).sum(axis=1))
 
     def best(self) -> tuple[dict[str, Any], float]:
-        """Return the best configuration of a Sobol sequence through the space, and what it is truly worth."""
+        """Return the best configuration of a Sobol sequence through the space, and its true mean steps."""
         points = sobol(len(self.space.parameters), N_PLACES)
         configs = [values_at(self.space, row) for row in points]
         truth = self.truth(np.array([places_of(self.space, values) for values in configs]))
@@ -180,11 +181,11 @@ class SimulatedConfig:
 
 
 def fit_of(curves: Curves) -> tuple[float, float]:
-    """Return how well a surrogate knows configurations that were left out, in ten folds.
+    """Return how well a surrogate predicts configurations that were left out, in ten folds.
 
     Returns:
-        Spearman's rank correlation of its mean logarithm of the test's mean steps with the measured one, and the share
-        of the variance that it explains.
+        Spearman's rank correlation of the predicted with the measured mean logarithm of the test's mean steps, and the
+        share of the variance that is explained.
     """
     places, known = curves.places(), curves.mean_over_seeds(np.log(curves.test["mean_steps"]))
     told = np.empty(len(known))

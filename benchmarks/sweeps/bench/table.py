@@ -18,14 +18,14 @@ from armscan.utils.files import atomic_write
 from benchmarks.sweeps.bench.design import Design, places_of
 
 FOLDER = Path(__file__).parent / "tables"
-# Fewer trainings of a configuration say little of the noise between seeds.
+# Fewer trainings of a configuration say too little about the noise between seeds.
 MIN_SEEDS = 3
 VALIDATION, SELECTION, TEST = "validation", "selection", "test"
 METRICS = (
     *("mean_steps", "success_rate", "on_plane_5mm_10deg", "on_plane_2mm_5deg"),
     *("mean_distance_mm", "mean_distance_deg", "mean_return"),
 )
-# Of each row, beside the values of its configuration and the metrics.
+# Columns of each row, beside the values of its configuration and the metrics.
 ROW = ("fixed_sha256", "commit", "config", "seed", "volumes", "env_steps", "processor_s")
 
 
@@ -63,13 +63,13 @@ class Curves:
 
     Args:
         sweep: Name of the sweep.
-        space: The space that the configurations are of.
+        space: Search space of the sweep.
         configs: Values by name of each configuration; the first is the default one.
-        config_of: Place of each training's configuration among them, shape (trainings,).
+        config_of: Index of each training's configuration in `configs`, shape (trainings,).
         env_steps: Environment steps at the end of each epoch, shape (epochs,).
         validation: Metrics of each epoch by name, shape (trainings, epochs).
-        selection: Metrics of the best epoch's weights by name, on the validation volumes in episodes that chose no
-            weights, shape (trainings,).
+        selection: Metrics of the best epoch's weights by name, on the validation volumes in episodes that did not
+            select weights, shape (trainings,).
         test: The same on the test volumes, shape (trainings,).
         processor_s: Processor seconds of each training, shape (trainings,).
     """
@@ -120,7 +120,7 @@ class Curves:
         )
 
     def of(self, numbers: NDArray[np.intp]) -> Curves:
-        """Return the curves of some configurations, given by their places; one that is there twice counts twice."""
+        """Return the curves of some configurations, given by index; one that is given twice counts twice."""
         trainings = [np.flatnonzero(self.config_of == number) for number in numbers]
         drawn = np.concatenate(trainings)
         return replace(

@@ -1,4 +1,4 @@
-"""Trials and trainings that a warm start saves: those until a study finds the best of a study without one."""
+"""Trials and trainings that a warm start saves until a study finds the best settings of a study without one."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class SimulatedSweep(NamedTuple):
 
     @classmethod
     def of(cls, sweep: str, pruner: str = DEFAULT.pruner) -> SimulatedSweep:
-        """Return a sweep with the table of its trainings, and with the seeds and the number of trials that it has.
+        """Return a sweep with the table of its trainings, and with its own number of seeds and trials.
 
         Args:
             sweep: Name of the sweep.
@@ -61,9 +61,9 @@ def replays(source: SimulatedSweep, target: SimulatedSweep, n_studies: int) -> p
         n_studies: Number of studies of each kind.
 
     Returns:
-        A row of each study, with columns (`trials` or `trainings`, `cold`, `warm` or `another cold`): how many it takes
-        until the truly best settings of the cold study, or better ones, have run to their end; one more than all if
-        they never do.
+        A row for each study, with columns (`trials` or `trainings`, `cold`, `warm` or `another cold`): the number until
+        the truly best settings of the cold study, or better ones, have run to their end; one more than all if they
+        never do.
     """
     rows = []
     for seed in range(n_studies):
@@ -84,11 +84,11 @@ def best_that_fit(found: Search, space: Space) -> tuple[dict[str, Value], ...]:
 
 
 def share_of(warm: pd.Series, cold: pd.Series) -> Estimate:
-    """Return the median with a warm start over the median without; its 95 % interval draws studies.
+    """Return the median with a warm start over the median without, with a 95 % bootstrap interval over studies.
 
     Args:
         warm: Trials or trainings of each study with a warm start.
-        cold: Those of the study without, in the same order.
+        cold: Trials or trainings of each study without, in the same order.
     """
 
     def share(warm: FloatArray, cold: FloatArray, axis: int = -1) -> FloatArray:

@@ -1,4 +1,4 @@
-"""The trials of `benchmarks.sweeps.sleeping`, run by Hydra's own Optuna sweeper in an environment of its own."""
+"""The trials of `benchmarks.sweeps.sleeping`, run by Hydra's own Optuna sweeper in its own virtual environment."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from benchmarks.sweeps.wait import WAITED_FILE, wait
 
 @hydra.main(config_path=".", config_name="config")
 def main(config: DictConfig) -> float:
-    """Wait as long as a trial of this number does on every platform; the value is what `lr` is."""
+    """Wait as long as the trial with this number does on every platform; return `lr` as its value."""
     hydra_config = HydraConfig.get()
     waited = wait(int(hydra_config.job.num), config.shortest_s, config.longest_s)
     left = {"worker": str(os.getpid()), "waited": waited}

@@ -1,6 +1,6 @@
-"""Trials that another process trains, run by Hydra's own Optuna sweeper in an environment of its own.
+"""Trials of Hydra's own Optuna sweeper that another process trains.
 
-The overrides of each trial go to standard output, a line of JSON each, and its value comes back on standard input.
+The overrides of each trial go to standard output as a line of JSON, and its value comes back on standard input.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-# Hydra logs on standard output, too: from here on that goes to standard error.
+# Hydra logs to standard output, too: redirect that to standard error.
 TRIALS = os.fdopen(os.dup(1), "w")
 os.dup2(2, 1)
 
 
 @hydra.main(version_base=None, config_path=None)
 def main(_: DictConfig) -> float:
-    """Have a trial trained, and return its value."""
+    """Let the other process train a trial, and return its value."""
     print(json.dumps(list(HydraConfig.get().overrides.task)), file=TRIALS, flush=True)
     return float(sys.stdin.readline())
 

@@ -20,7 +20,7 @@ from tests.sweeps.study.test_final_eval import run as run_final
 
 @pytest.fixture
 def answer(armscan):
-    """Run `armscan report` in a folder of its own; return its exit code and what it printed."""
+    """Run `armscan report` in an empty folder; return its exit code, standard output and standard error."""
     return partial(armscan, "report")
 
 
@@ -130,7 +130,7 @@ def test_history_has_the_best_so_far_and_every_number_is_rounded(answer, tmp_pat
     assert best["y"] == [min(points["y"][: end + 1]) for end in range(len(points["y"]))]
     body = page.partition("<h1>")[2]
     shown = re.sub(r"<script.*?</script>|<details.*?</details>", "", body, flags=re.DOTALL)
-    # More than four digits after the zeros.
+    # Decimals with more than four digits after the zeros.
     assert not re.findall(r"\d\.0*[1-9]\d{4,}", shown)
     (typed,) = re.findall(r"<code>agent.lr=([\d.e-]+)</code>", page)
     assert float(typed) == points["y"][0]

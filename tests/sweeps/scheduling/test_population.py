@@ -31,7 +31,7 @@ SIZE, N_GENERATIONS, INTERVAL = 6, 5, 100
 
 
 class Simulation:
-    """A population whose members gain what their learning rate is worth in each generation, and nothing is trained."""
+    """A population without training: in each generation, a member's value improves by its learning rate."""
 
     def __init__(self, folder, seed=0, is_maximized=True, **settings):
         sampler = PopulationSampler(SIZE, INTERVAL, **settings)
@@ -64,7 +64,7 @@ class Simulation:
         self.scheduler.storage.exclusive(lambda: self.scheduler._tell(outcome, is_repeated=False))
 
     def run(self, n_workers, drawn, p_death=0.0, p_failure=0.0, seen=lambda: None):
-        """Run the whole study with workers that end in any order, die, and fail."""
+        """Run the whole study, with workers that finish in any order and die, and trials that fail."""
         held = {}
         while True:
             for worker in range(n_workers):
@@ -113,7 +113,7 @@ def test_each_member_completes_each_generation_once_although_workers_die_and_tri
             assert all(parent.number in kept for kept in before)
         start = trial.user_attrs["generation"] * INTERVAL
         assert trial.user_attrs["interval"] == [start, start + INTERVAL]
-    # What was given up once is never wanted again, and little is kept.
+    # A checkpoint that was given up is never wanted again, and few are kept.
     for (n_before, before), (_, after) in pairwise(to_keep):
         assert not {each for each in after if each < n_before} - before
     assert max(len(kept) for _, kept in to_keep) <= 3 * SIZE + 2 * n_workers
@@ -162,7 +162,7 @@ def test_population_does_better_than_values_that_stay_as_they_were_drawn(tmp_pat
         values = [trial.values[0] for trial in complete(Simulation(folder, **settings).run(2, random.Random(0)))]
         return max(values)
 
-    # So little exploits that a single member does.
+    # With so small a quantile, a single member exploits.
     assert best("a") > best("b", quantile=1e-9) > 0
 
 

@@ -280,7 +280,7 @@ def test_witness_knows_a_process_that_is_gone_and_one_that_has_its_number(make_s
     assert liveness.is_dead(scheduler.state().running[0])
     scheduler.renew(_trial(scheduler), here)
     process.kill()
-    # Killed, and not yet waited for: nothing but an exit code is left of it.
+    # Killed and not yet waited for: a zombie.
     wait_until(lambda: liveness.is_dead(scheduler.state().running[0]))
     process.join()
     assert liveness.is_dead(scheduler.state().running[0])
@@ -304,7 +304,7 @@ def test_witness_takes_a_worker_elsewhere_for_dead_when_its_lease_is_not_renewed
         assert not any(found_dead_after(0, 10, 10, 10))
     assert found_dead_after(9, 10) == [False, True]
     scheduler.renew(_trial(scheduler), lease | {"beat": 3})
-    # Nobody looked for long, because the storage was unavailable: then it could not be renewed, either.
+    # Nobody checked for long, because the storage was unavailable: then the lease could not be renewed, either.
     assert found_dead_after(0, 10, 500, 10, 10) == [False, False, False, False, True]
 
 
@@ -322,7 +322,7 @@ def test_keepers_of_many_trials_take_turns_in_looking_after_them(make_scheduler,
     for _ in range(9):
         heartbeat._renew()
         now_s[0] += lease_module.HEARTBEAT_S
-    # Five trials, of whose workers two may look in a beat: each after two beats, as two and a half cannot be.
+    # Five trials, of whose workers two may check per beat: each checks every second beat, 5 / 2 rounded down.
     assert [look_s - 100 for look_s in looks] == [0, 20, 40, 60, 80]
     own = [trial.user_attrs[LEASE]["beat"] for trial in state().running if trial.user_attrs[LEASE]["worker"] == "a"]
     assert own == [9]
@@ -354,7 +354,7 @@ def test_failures_of_final_trainings_that_had_begun_to_train_do_not_end_them(mak
     scheduler = make_scheduler(n_trials=100, max_failures=50)
     for number in range(4):
         trial = scheduler.claim({"worker": str(number)})
-        # Nothing is reported there.
+        # Final trainings report nothing.
         scheduler.renew(trial, {"worker": str(number), "env_steps": 500})
         fail(scheduler, trial, "diverged")
     assert scheduler.failure_reason(scheduler.state()) is None

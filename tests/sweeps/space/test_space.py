@@ -1,4 +1,4 @@
-"""Search spaces: what may stand in them, what a trial is given, how it is written."""
+"""Search spaces: what they may contain, what a trial is given, and how that is written."""
 
 import optuna
 import pytest

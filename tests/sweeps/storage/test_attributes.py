@@ -1,4 +1,4 @@
-"""A study in a storage that a stranger has written: refused in one line, or worked with."""
+"""A study in a storage that a stranger has written: refused in one line, or usable."""
 
 import json
 import sqlite3
@@ -94,7 +94,7 @@ def test_attribute_that_a_stranger_writes_while_a_study_runs_is_one_line_or_harm
         for key, damaged in damage.items():
             stranger._storage.set_trial_user_attr(trial._trial_id, key, damaged)
         was_refused = is_refused(lambda study=study: work_with(study, tmp_path))
-        # As when it is opened.
+        # The same as when a study is opened.
         sound = study_with(damage)
         assert was_refused == is_refused(lambda sound=sound: check_trials(sound))
         if was_refused:
@@ -199,7 +199,7 @@ def test_report_of_journal_lines_that_optuna_has_not_written_is_one_line(armscan
     trial.set_user_attr("env_steps", 3)
     trial.report(0.5, 1)
     study.tell(trial, 1.0)
-    # As a stranger would write it: sound in itself, without sums.
+    # As a stranger would write it: consistent, without checksums.
     lines = [json.loads(line) for line in journal.read_text().splitlines()]
     for line in lines:
         del line["sum"]

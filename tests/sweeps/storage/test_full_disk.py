@@ -52,7 +52,7 @@ def test_study_waits_while_its_disk_is_full_and_loses_no_trial(disk, uri, capfd)
     told = []
 
     def is_waiting():
-        # One worker at least: it may hold the lock that the other waits for.
+        # At least one worker waits: it may hold the lock that the other waits for.
         told.extend(capfd.readouterr())
         return any(f"the storage is unavailable ({reason}): waiting" in "".join(told) for reason in FULL)
 

@@ -23,7 +23,7 @@ def fill(storage, n_trials=3):
 
 
 def seen_in(file):
-    """All that a reader sees of the studies in a file."""
+    """Return all that a reader sees of the studies in a file."""
     storage = existing_storage(str(file)).optuna
     studies = [(study.study_name, study.user_attrs, study.system_attrs) for study in storage.get_all_studies()]
     return studies, [storage.get_all_trials(study._study_id) for study in storage.get_all_studies()]
@@ -101,7 +101,7 @@ def test_journal_of_an_earlier_version_is_read_and_what_is_appended_protects_it(
     file = tmp_path / "a.journal"
     fill(JournalStorage(JournalFileBackend(str(file))))
     earlier = file.read_bytes().splitlines(keepends=True)
-    # Of lines without a sum, at least those that make trials cannot be lost unseen.
+    # Of lines without a checksum, at least those that create studies and trials cannot be lost unnoticed.
     for at, line in enumerate(earlier):
         if json.loads(line)["op_code"] in (0, 4):
             check_refused(file, earlier[:at] + earlier[at + 1 :])

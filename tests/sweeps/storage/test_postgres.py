@@ -1,4 +1,4 @@
-"""A study on services that many machines share, as a person starts it."""
+"""A study on services that many machines share, as a user starts it."""
 
 import contextlib
 import json
@@ -37,7 +37,7 @@ TRACKING_PASSWORD = "not-for-anybody"
 
 
 def processes_with(texts):
-    """Return the words of all processes of this machine in which one of the texts stands."""
+    """Return the command lines of this machine's processes that contain one of the texts."""
     found = []
     for words in Path("/proc").glob("[0-9]*/cmdline"):
         with contextlib.suppress(OSError):
@@ -48,7 +48,7 @@ def processes_with(texts):
 
 @contextlib.contextmanager
 def watched(look):
-    """Look again and again while something lasts; give the list of what was seen."""
+    """Poll `look` during the block; yield the list of what was seen."""
     seen, is_over = [], threading.Event()
 
     def watch():

@@ -17,5 +17,5 @@ def test_worker_goes_to_the_storage_twelve_times_for_a_trial_with_ten_reports(po
         trials = phase.scheduler.study.get_trials()
         assert [trial.state.name for trial in trials] == ["COMPLETE"] * n_trials
         assert all(len(trial.intermediate_values) == 10 for trial in trials)
-    # The first start runs three trials and the second five; what remains is to find that there are no more.
+    # The first start runs three trials and the second five; both then find that there are no more.
     assert counts[1] - counts[0] == 12 * 2

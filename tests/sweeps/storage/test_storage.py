@@ -1,4 +1,4 @@
-"""Storages of studies: opened, locked, mended."""
+"""Storages of studies: opened, locked, repaired."""
 
 import json
 import multiprocessing

@@ -31,7 +31,7 @@ FINAL_EVAL = {"top_k": 2, "min_seeds": 2, "mean_seeds": 4, "judge_seeds": 3}
 # Mean steps of each configuration on all volumes: the luckiest trial of the search is not the best.
 TRUE = {CONTROL: 6.0, 0: 5.0, 1: 3.0, 2: 9.0}
 LUCK = {0: 1.0, 1: 2.0, 2: 9.0}
-# Nothing happens by chance.
+# No worker dies, and trainings end in order.
 QUIET = SimpleNamespace(random=lambda: 1.0, randrange=lambda n: 0)
 
 
@@ -119,7 +119,7 @@ def test_test_volumes_are_opened_for_the_chosen_configuration_and_the_control_al
     assert final.candidates() == [CONTROL, 0, 1]
     assert final.race().chosen == 1
     assert {number for number, _ in trained(final.judgement)} == {CONTROL, 1}
-    # No seed of the search, nor of the selection, judges.
+    # The judgement uses no seed of the search or the selection.
     assert {seed for _, seed in trained(final.selection)} <= set(range(1000, 1005))
     assert {seed for _, seed in trained(final.judgement)} == {2000, 2001, 2002}
     judgement = judge(final)
@@ -218,7 +218,7 @@ def test_control_that_is_the_best_is_the_result(storage_uri):
 @pytest.mark.parametrize(("top_k", "candidates"), [(0, []), (1, [CONTROL, 1]), (2, [CONTROL, 1, 2])])
 def test_trial_with_the_settings_of_the_control_is_no_candidate_beside_it(storage_uri, top_k, candidates):
     storage, asked, search = searched(storage_uri, top_k=top_k)
-    # Neither a sampled nor a taken trial says that it has them.
+    # Neither a sampled trial nor one that was taken over is marked as having them.
     final = FinalEvaluation.opened(storage, asked, search, search.trials[0].params)
     assert final.candidates() == candidates
     # As a report reads it.
@@ -312,7 +312,7 @@ def test_member_of_the_latest_generation_is_trained_with_its_whole_schedule(stor
     member.suggest_float("agent.lr", 1e-4, 1e-2)
     search.tell(member, 99.0)
     final = FinalEvaluation.opened(storage, asked, search, None)
-    # Better values of earlier generations are not those of whole trainings.
+    # Better values of earlier generations are not of whole trainings.
     assert final.candidates() == [CONTROL, member.number]
     planned = [each for each in final.missing_of_selection() if each.attributes[FINALIST] == member.number]
     assert len(planned) == FINAL_EVAL["min_seeds"]

@@ -1,11 +1,7 @@
 """A study opened for work, and the runs of the tracking store that its storage names."""
 
-import shutil
-from types import SimpleNamespace
-
 import optuna
 import pytest
-from omegaconf import OmegaConf
 from optuna.trial import TrialState
 from optuna_dashboard import get_note, save_note
 
@@ -13,26 +9,6 @@ from armscan.errors import TrackingError
 from armscan.sweeps.storage.attribute_names import NOTE_SUM, STUDY_RUN
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.dashboard import note_run
-from armscan.sweeps.study.open import open_for_work
-from armscan.tracking import open_store
-from tests.sweeps.study.test_study import settings
-
-TASK = SimpleNamespace(run=None, validate=None, evaluate=None, final_metric="test/mean_steps")
-
-
-@pytest.fixture
-def opened(tmp_path, empty_database, monkeypatch):
-    """Open a study of a name in a storage of its own; all are tracked in one store."""
-    monkeypatch.chdir(tmp_path)
-    shutil.copy(empty_database, tmp_path / "runs.db")
-    tracking = {"uri": "sqlite:///runs.db", "experiment": "a", "artifacts": "artifacts", "wait_s": 60.0}
-
-    def open_study(storage="optuna.journal", name="a"):
-        asked = settings(name=name, storage=storage, folder=f"studies/{name}")
-        return open_for_work(asked, TASK, OmegaConf.create({"tracking": tracking}), ["sweep=a"])
-
-    open_study.store = open_store(**tracking)
-    return open_study
 
 
 @pytest.mark.parametrize("kind", ["another study's", "a trial's", "of another experiment", "nobody's"])
@@ -56,7 +32,7 @@ def test_run_of_a_study_that_is_anothers_is_refused_and_left_as_it_is(opened, ki
 
 
 def note_result(search, result):
-    """Note a result at a study, as its launcher does; return what the dashboard shows then."""
+    """Add a result to a study's note, as its launcher does; return the note that the dashboard shows."""
     study = search.scheduler.study
     note_run(study, search.client, search.experiment_id, search.run_id, search.folder, result)
     return get_note(study)

@@ -1,4 +1,4 @@
-"""The population that a study asks for, and what it cannot be asked for."""
+"""The population that a study's settings describe, and the settings that are refused."""
 
 import pytest
 from omegaconf import OmegaConf

@@ -88,7 +88,7 @@ def test_trial_that_others_dominate_is_pruned_at_its_first_report_on_a_rung(repo
     for good in (0.8, 0.9):
         assert report({100: (good, 5.0), 200: (good, 5.0)}) is None
     assert report({50: (0.0, 9.0), 100: (0.1, 9.0), 200: (0.1, 9.0)}) == 100
-    # Later than the rung, because it reports seldom.
+    # Later than the rung, because it reports rarely.
     assert report({150: (0.1, 9.0)}) == 150
     # Only between two rungs is it behind.
     assert report({100: (0.95, 5.0), 150: (0.0, 9.0), 200: (0.95, 5.0)}) is None

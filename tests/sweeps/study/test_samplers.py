@@ -16,7 +16,7 @@ SPACE = {name: optuna.distributions.FloatDistribution(-3.0, 3.0) for name in "xy
 
 
 class Opened:
-    """Executes code where it is unpickled."""
+    """An object that executes code when it is unpickled."""
 
     def __init__(self, marker):
         self.marker = str(marker)

@@ -1,4 +1,4 @@
-"""A study in its storage: the same one goes on, another is refused with what differs."""
+"""A study in its storage: the same one is resumed, another is refused with what differs."""
 
 import optuna
 import pytest
@@ -76,6 +76,14 @@ def test_study_that_has_changed_is_refused_with_what_differs(storage_uri, change
     with pytest.raises(StudyError) as error:
         make_study(open_storage(storage_uri), settings(**changes), FIXED | fixed)
     assert line in str(error.value)
+
+
+def test_study_with_its_objectives_in_another_order_is_refused(storage_uri):
+    objectives = {"mean_steps": "minimize", "success_rate": "maximize"}
+    make_study(open_storage(storage_uri), settings(objectives=objectives), FIXED)
+    swapped = dict(reversed(objectives.items()))
+    with pytest.raises(StudyError, match="has its objectives in another order: mean_steps, success_rate"):
+        make_study(open_storage(storage_uri), settings(objectives=swapped), FIXED)
 
 
 def test_study_that_has_changed_goes_on_where_that_is_accepted_from_then_on(storage_uri):
@@ -157,5 +165,5 @@ def test_study_with_another_space_is_refused_before_it_is_opened_although_change
     with pytest.raises(StudyError, match="searches another space"):
         existing_study(storage, other, FIXED)
     study = existing_study(storage, settings(allow_config_changes=True), FIXED | {"stack": 4})
-    # Only to look at: the change is kept when the study is opened.
+    # Only read here: the change is stored when the study is opened.
     assert "stack" not in study.user_attrs["fixed_config"]

@@ -1,4 +1,4 @@
-"""Terminators: a study ends when no more can be gained, by what is in its storage, and stays ended."""
+"""Terminators: a study ends when no more can be gained, decided from its storage alone, and stays ended."""
 
 import statistics
 
@@ -59,7 +59,7 @@ def test_stagnation_follows_the_direction_and_says_so():
 
 
 def noisy(n_trials, noise, seed=0):
-    """Return a study of a bowl, with two seeds of each trial."""
+    """Return a study of a noisy parabola, with two seeds of each trial."""
     rng, study = np.random.default_rng(seed), optuna.create_study()
     for x in rng.random(n_trials):
         seeds = {str(each): {"mean_steps": float((x - 0.5) ** 2 + noise * rng.normal())} for each in (0, 1)}
@@ -89,7 +89,7 @@ def test_study_goes_on_where_seeds_hardly_differ():
 
 @pytest.fixture
 def make(storage_uri):
-    """Open the same study again and again, as workers do; it ends after so many finished trials."""
+    """Return a function that opens the same study, as each worker does; it ends after `last` finished trials."""
 
     def opened(asked="a", last=2):
         storage = open_storage(storage_uri)
@@ -117,7 +117,7 @@ def run_one(scheduler):
 def test_every_worker_ends_where_one_has_found_that_the_study_ends(make):
     first, second = make(), make()
     assert [run_one(first) is not None for _ in range(3)] == [True, True, False]
-    # Found by the other, without a look of its own.
+    # Found by the other, without a check of its own.
     assert second.claim({"worker": "b"}) is None
     assert second.end_reason(second.state()) == "2 are enough"
 

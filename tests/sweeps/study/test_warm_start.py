@@ -1,4 +1,4 @@
-"""Warm starts: trials of others whose configuration is the same, else their best settings; and presets."""
+"""Warm starts: trials of studies with the same configuration, otherwise their best settings; and presets."""
 
 import optuna
 import pytest
@@ -28,7 +28,7 @@ ZY = FIXED | {"projection": "zy"}
 
 @pytest.fixture
 def study_in(tmp_path):
-    """Make a study of a space in the storage, with a finished trial of each of some values."""
+    """Make a study of a space in the storage, with a finished trial for each row of values."""
 
     def make(name, space, fixed=FIXED, rows=(), **changes):
         asked = settings(name=name, storage=str(tmp_path / "a.journal"), space=Space.read(space), **changes)
@@ -48,7 +48,7 @@ def study_in(tmp_path):
 
 
 def begin(made, fixed=FIXED):
-    """Let a study begin; return what is told."""
+    """Add the initial trials of a study; return their messages."""
     asked, storage, study = made
     initial = initial_trials(asked, [], fixed, study)
     for each in initial:
@@ -76,7 +76,7 @@ def test_edited_space_takes_what_fits(study_in):
         ({"agent.lr": 2e-3, "agent.gamma": 0.5}, 3.0),
     ]
     study_in("before", {"agent.lr": LR, "agent.gamma": {"choices": [0.5, 0.9]}}, rows=rows)
-    # A narrower range, a key less, and one more, which had a value in the configuration.
+    # A narrower range, one key fewer, and a new one, which had a value in the configuration.
     space = {"agent.lr": LR | {"low": 1e-3}, "agent.tau": {"low": 0.001, "high": 0.1}}
     made = study_in("now", space, warm_start=["before"])
     (told,) = begin(made)
@@ -103,7 +103,7 @@ def test_value_of_a_key_that_is_searched_no_more_must_be_the_fixed_one(study_in)
 def test_best_settings_of_another_configuration_are_tried_first_without_their_values(study_in, changes, fixed, why):
     rows = [({"agent.lr": 5e-4 * (20 - each), "stack": 1}, float(each)) for each in range(N_ENQUEUED + 3)]
     study_in("before", {"agent.lr": LR, "stack": STACK}, rows=rows)
-    # Settings that differ only in what this study does not try are one.
+    # Settings that differ only in keys that this study does not search count as one.
     made = study_in("now", {"agent.lr": LR, "agent.gamma": {"choices": [0.5]}}, fixed, warm_start=["before"], **changes)
     (told,) = begin(made, fixed)
     assert f"none taken with its value, because {why}; the settings of the best {N_ENQUEUED} are tried first" in told

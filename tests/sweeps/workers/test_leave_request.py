@@ -40,7 +40,7 @@ def test_a_request_can_interrupt_another_at_any_moment(first, second):
 
 
 def interrupted(first, second, n_before):
-    """Return what is asked for if one request interrupts another after so many instructions; None if it has fewer."""
+    """Return the request after one call interrupts another after `n_before` instructions; None if it has fewer."""
     request = LeaveRequest()
     n_instructions = 0
 
@@ -57,7 +57,7 @@ def interrupted(first, second, n_before):
         sys.settrace(interrupt)
         getattr(request, first)()
 
-    # A thread that waits for itself does not end.
+    # A deadlocked thread does not end.
     thread = threading.Thread(target=ask, daemon=True)
     thread.start()
     thread.join(10.0)

@@ -1,4 +1,4 @@
-"""Whose process a worker judges: only one that it sees, however the machines are called."""
+"""Whose process a worker judges: only one that it can see, whatever the machines are called."""
 
 import os
 import shutil
@@ -38,7 +38,7 @@ work(make_scheduler, 20)
 
 @pytest.fixture
 def unshare():
-    """Start Python in PID namespaces of their own, in which each process has the number 1."""
+    """Yield a function that starts Python in its own PID namespace, where its process ID is 1."""
     if shutil.which("unshare") is None or subprocess.run([*IN_A_NAMESPACE, "true"], capture_output=True).returncode:
         unavailable("no PID namespace can be made here: it needs util-linux and root")
     started = []
@@ -55,7 +55,7 @@ def unshare():
 
 
 def is_dead(lease, *, monkeypatch):
-    """Return what a worker says of another at the first look, and after 50 s without a heartbeat."""
+    """Return whether a worker takes another for dead at the first check, and after 50 s without a heartbeat."""
     now_s, liveness = [100.0], LivenessCheck()
     monkeypatch.setattr(heartbeat.time, "monotonic", lambda: now_s[0])
     trial, said = SimpleNamespace(number=0, user_attrs={LEASE: lease}), []
@@ -90,7 +90,7 @@ def test_process_file_of_an_earlier_version_is_read_and_its_process_not_judged(t
     (tmp_path / "worker-0.json").write_text(f'{{"host": "{os.uname().nodename}", "pid": 1, "started": "1"}}')
     process = ProcessInfo.read(tmp_path / "worker-0.json")
     assert (process.is_here, process.is_alive) == (False, True)
-    # Nobody is killed for having the number of a worker.
+    # No process is killed for having the ID of a worker.
     assert local_workers(tmp_path) == []
 
 

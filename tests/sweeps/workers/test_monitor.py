@@ -1,4 +1,4 @@
-"""A study that is watched from afar: when it is over, and whether anybody is at work."""
+"""Monitoring a study whose workers run elsewhere: when it is over, and whether anybody is at work."""
 
 import threading
 import time

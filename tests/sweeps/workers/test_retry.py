@@ -42,7 +42,7 @@ def open_scheduler(postgres):
 
 @pytest.fixture(params=[True, False], ids=["done", "undone"])
 def lose_commit(request, monkeypatch):
-    """Lose the connection while the next transaction that changes anything is committed, once it is done or before."""
+    """Return a function that loses the connection during the next commit of a change, after or before it is done."""
 
     def lose(scheduler, meanwhile=lambda: None):
         import psycopg

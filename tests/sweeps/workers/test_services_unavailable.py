@@ -1,4 +1,4 @@
-"""A study whose PostgreSQL and whose MLflow server are unavailable for a while in the middle of it."""
+"""A study whose PostgreSQL and MLflow servers are unavailable for a while in the middle of it."""
 
 import contextlib
 import os
@@ -18,7 +18,7 @@ from tests.support.postgres import postgres_server
 from tests.support.waiting import HANG_S, wait_until
 
 REPOSITORY = Path(__file__).parents[3]
-# A real, short training with a report after each of its epochs: four seconds and more of them.
+# A real, short training of four seconds or more, with a report after each epoch.
 TRAINING = [
     *(
         "training.env_steps=3600",
@@ -44,7 +44,7 @@ def services(postgres_programs, tmp_path):
 
 @contextlib.contextmanager
 def study(folder, storage_uri, tracking_uri, *words):
-    """Yield a study as a person starts it, ended in any case."""
+    """Yield a study as a user starts it; end it in any case."""
     environment = {"ARMSCAN_STORAGE": storage_uri, "MLFLOW_TRACKING_URI": tracking_uri, "PYTHONPATH": str(REPOSITORY)}
     folder.mkdir()
     with (folder / "printed").open("wb") as printed:
@@ -77,13 +77,13 @@ def has_begun(folder, seed_folder):
 
 
 def assert_complete(storage_uri, tracking_uri, n_trials):
-    """All trials have finished, none twice, and what MLflow has of them is whole."""
+    """Check that all trials have finished, none twice, and that MLflow has all of them."""
     trials = optuna.load_study(study_name="sac_y", storage=open_storage(storage_uri).optuna).trials
     assert [trial.state.name for trial in trials] == ["COMPLETE"] * n_trials
     assert not [trial for trial in trials if RETRY_OF in trial.user_attrs]
     client = MlflowClient(tracking_uri)
     runs = client.search_runs([client.get_experiment_by_name("armscan").experiment_id])
-    # The study's own, and of each trial its own and that of its seed.
+    # The run of the study, and for each trial its own and that of its seed.
     assert [run.info.status for run in runs] == ["FINISHED"] * (1 + 2 * n_trials)
     of_seeds = [run for run in runs if "config.sha256" in run.data.tags and "volumes.training" in run.data.tags]
     assert len(of_seeds) == n_trials
@@ -116,6 +116,6 @@ def test_study_loses_nothing_while_its_services_are_away(services, tmp_path, awa
     assert_complete(storage_uri, server.uri, 2)
     log = worker_log(folder)
     assert log.count("the storage is unavailable") == log.count("the storage is back") == 1
-    # Of each run that was at hand, once.
+    # Once for each run that was open.
     said = [line.partition("  ")[2] for line in log.splitlines() if "cannot be reached or written to" in line]
     assert 1 <= len(said) == len(set(said)) <= 4

@@ -1,4 +1,4 @@
-"""A worker and its trials, which train nothing here: what they draw, what becomes of those that fail."""
+"""A worker and its trials, without training: what they draw, and what becomes of those that fail."""
 
 import errno
 import os
@@ -45,7 +45,7 @@ def far_from_a_thousandth(attempt):
 
 @pytest.fixture
 def make_phase(tmp_path, empty_database):
-    """Return a function that makes a study in a folder, and the phase of it."""
+    """Return a function that makes a study in a folder, and returns its phase."""
 
     def make(
         folder,
@@ -102,7 +102,7 @@ def make_heartbeat(scheduler, on_death=lambda _: None):
 
 @pytest.fixture
 def work(tmp_path, make_phase):
-    """Let one worker run a study in a folder of its own; return the study."""
+    """Return a function that lets one worker run a study in its own folder, and returns the study."""
 
     def run_study(*arguments, **options):
         phase = make_phase(*arguments, **options)
@@ -171,7 +171,7 @@ def test_last_checkpoint_stays_until_the_storage_has_the_outcome_of_its_trial(wo
     folder = work.storage("a").lock_file.parent
     study = work("a", trained, n_trials=2)
     assert there == [True, True, True]
-    # Only a trial that failed may still be looked into.
+    # Only a failed trial keeps its last checkpoint.
     states = {Path(trial.user_attrs["folder"]).name: trial.state.name for trial in study.trials}
     assert states == {"0000": "COMPLETE", "0001": "FAIL", "0002": "COMPLETE"}
     assert [file.parts[-3] for file in folder.rglob(LAST_CHECKPOINT)] == ["0001"]
@@ -223,7 +223,7 @@ def test_worker_that_is_told_to_leave_while_it_opens_a_tracked_run_leaves_a_tria
     def leave():
         told.clear()
         left.set()
-        # As of a process that has left.
+        # As if the process had exited.
         beating.opening.release()
 
     def run(attempt):
@@ -388,7 +388,7 @@ def test_stopped_study_requeues_its_trial_and_goes_on_when_it_is_started_again(w
 
     study = work("a", stopped_in_the_second, n_trials=3)
     assert [trial.state.name for trial in study.trials] == ["COMPLETE", "WAITING"]
-    # Until it is told to go on, workers that come do nothing.
+    # Until the study is resumed, new workers do nothing.
     assert len(work("a", n_trials=3).trials) == 2
     scheduler = TrialScheduler(study, work.storage("a"), Limits(n_trials=3))
     assert scheduler.resume()
@@ -398,7 +398,7 @@ def test_stopped_study_requeues_its_trial_and_goes_on_when_it_is_started_again(w
 
 @pytest.fixture
 def phases_with_training_of_another(monkeypatch, make_phase):
-    """Return a function that makes phases whose selection waits for another worker's training, and tells its end."""
+    """Return a function that makes phases whose selection waits for another worker's training, and what ends that."""
 
     def make(judge):
         chosen = 0
@@ -443,7 +443,7 @@ def test_worker_judges_the_control_while_another_has_the_last_training_of_the_se
 def test_worker_judges_nothing_once_the_study_is_stopped(monkeypatch, phases_with_training_of_another):
     opened, end_training = phases_with_training_of_another(lambda attempt: {"mean_steps": 1.0})
     opened.finals[0].scheduler.study.set_user_attr(STOP, "by somebody")
-    # Here, a worker waits.
+    # Called where a worker waits.
     monkeypatch.setattr(worker, "time", SimpleNamespace(sleep=lambda _: end_training()))
     worker.work(["data.n_training=1"], make_heartbeat)
     assert [len(phase.scheduler.state().all) for phase in opened.phases] == [1, 1, 0]

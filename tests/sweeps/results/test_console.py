@@ -1,0 +1,51 @@
+"""The result of a study in the terminal, and the exit code of its command."""
+
+import os
+
+import pytest
+from optuna.trial import TrialState
+
+from armscan.sweeps.results.console import print_result
+from armscan.sweeps.scheduling.state import CONTROL, FAILURES_AT_ONCE
+from armscan.sweeps.storage.attribute_names import FINAL_SEED, FINALIST
+from armscan.sweeps.study.settings import FinalEvalSettings
+
+
+@pytest.fixture
+def study(opened):
+    return opened(final_eval=FinalEvalSettings(top_k=1, min_seeds=1, mean_seeds=1, judge_seeds=1))
+
+
+@pytest.fixture
+def searched(study):
+    """Return the study after its search."""
+    search = study.search.scheduler.study
+    for _ in range(study.settings.n_trials):
+        search.tell(search.ask(), 1.0)
+    return study
+
+
+def test_study_whose_workers_have_ended_before_its_trials_can_be_resumed(study, capsys):
+    assert print_result(study) == os.EX_TEMPFAIL
+    assert "only 0 of 5 trials have finished" in capsys.readouterr().err
+
+
+def test_study_whose_final_trainings_are_missing_can_be_resumed(searched, capsys):
+    assert print_result(searched) == os.EX_TEMPFAIL
+    assert "trainings are missing; the same command resumes the study" in capsys.readouterr().err
+
+
+def test_failed_study_is_not_worth_the_same_command(study):
+    search = study.search.scheduler.study
+    for _ in range(FAILURES_AT_ONCE):
+        search.tell(search.ask(), state=TrialState.FAIL)
+    assert print_result(study) == 1
+
+
+def test_study_with_a_failed_final_training_is_not_worth_the_same_command(searched):
+    judgement = searched.finals[1].scheduler.study
+    failed = judgement.ask()
+    failed.set_user_attr(FINALIST, CONTROL)
+    failed.set_user_attr(FINAL_SEED, 0)
+    judgement.tell(failed, state=TrialState.FAIL)
+    assert print_result(searched) == 1
