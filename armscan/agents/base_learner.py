@@ -159,7 +159,7 @@ class SupervisedLearner(BaseLearner):
 
 def labelled_envs_of(envs: Any) -> ArmscanVectorEnv:
     """Return the environments that give a supervised learner the labelled planes."""
-    assert isinstance(envs.unwrapped, ArmscanVectorEnv), "only these say where the optimal planes lie"
+    assert isinstance(envs.unwrapped, ArmscanVectorEnv), "only these environments have labelled planes"
     return envs.unwrapped
 
 

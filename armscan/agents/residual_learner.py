@@ -90,7 +90,7 @@ class ResidualLearner(PlaneFinderLearner):
         self._pretraining_env_steps = pretraining_env_steps
         super().__init__(parameters, replace(setup, total_env_steps=pretraining_env_steps))
         finder, tilt = self._module, math.sin(math.radians(correction_deg))
-        assert isinstance(finder, FinderModule), "only the teaching's own module is corrected"
+        assert isinstance(finder, FinderModule), "SAC corrects only the pretraining's own module"
         limits = torch.tensor([tilt, tilt, correction_mm, correction_mm], device=self._device)
         sac_setup = replace(
             setup,
@@ -122,7 +122,7 @@ class ResidualLearner(PlaneFinderLearner):
     @property
     def update_note(self) -> str:
         """Return how the gradient steps of SAC are computed."""
-        return f"{self._sac.update_note}, after the teaching"
+        return f"{self._sac.update_note}, after pretraining"
 
     def learn(self, n_env_steps: int) -> dict[str, float]:
         """Learn for one epoch, cut short at the end of the pretraining; see `Learner.learn`."""

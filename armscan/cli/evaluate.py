@@ -202,7 +202,7 @@ def _check_words(run: Sequence[str], agent: str | None, data: str | None, change
         key = word.partition("=")[0].lstrip("+~")
         if key in OPTIONS or key.startswith(("tracking.", "evaluation.")):
             option = OPTIONS.get(key, "options of armscan evaluate")
-            raise click.UsageError(f"{key} is for armscan run, and not read here: give {option}")
+            raise click.UsageError(f"{key} cannot be set here: give {option}")
         if key in given:
             raise click.UsageError(f"{given[key]} and {key} are both given, but they are one value: give one of them")
 

@@ -68,7 +68,7 @@ def _watch(write: Callable[[int | None], Path]) -> None:
     from armscan.errors import StorageUnavailableError
     from armscan.utils.retry import no_retry
 
-    print(f"look at   {write(WATCH_S)}", f"it is written every {WATCH_S} s; Ctrl-C ends that", sep="\n", flush=True)
+    print(f"look at   {write(WATCH_S)}", f"updated every {WATCH_S} s until Ctrl-C", sep="\n", flush=True)
     try:
         while True:
             time.sleep(WATCH_S)

@@ -109,7 +109,7 @@ def show(run: str, tracking: str) -> None:
 )
 @click.argument("what", type=click.Choice(["checkpoints", "folders"]))
 @_with_selection
-@click.option("--apply", is_flag=True, help="Remove; without it, nothing is touched.")
+@click.option("--apply", is_flag=True, help="Remove; without it, nothing is removed.")
 @tracking_option()
 def prune(what: str, apply: bool, tracking: str, sort: str, limit: int | None, **selected: Any) -> int:
     """Remove checkpoints or folders of ended runs.
@@ -133,7 +133,7 @@ def prune(what: str, apply: bool, tracking: str, sort: str, limit: int | None, *
         print_plan(cases)
     taken = [case for case in cases if case.left is None]
     freed = decimal(sum(case.n_bytes for case in taken))
-    print(f"{what} of {len(taken)} of {len(cases)} runs would be removed, {freed}; nothing is touched")
+    print(f"{what} of {len(taken)} of {len(cases)} runs would be removed, {freed}; nothing was removed")
     if taken:
         print(f"remove it {armscan_command(*click.get_current_context().obj, '--apply')}")
     return 0
@@ -183,21 +183,21 @@ def sync(folder: Path, tracking: str | None, trust: bool) -> int:
     """
     from armscan.config.trust import check_stored_address
     from armscan.tracking import open_existing_store
-    from armscan.tracking import sync as deliver
+    from armscan.tracking import sync as upload_left
 
     def opened(tracked_in: str) -> TrackingStore:
         if tracking is None and not trust:
             check_stored_address(tracked_in)
         return open_existing_store(tracking or tracked_in)
 
-    deliveries = deliver(folder, cache(opened), trust=trust)
-    for delivery in deliveries:
-        which = f"run {delivery.run_id}" if delivery.run_id else "a run"
-        left = f", the rest is left: {delivery.left}" if delivery.left else ""
-        print(printable(f"{which} in {delivery.folder}: {delivery.n_entries} entries delivered{left}"))
-    if not deliveries:
-        print(f"{folder}: nothing is left to be delivered")
-    return 1 if any(delivery.left for delivery in deliveries) else 0
+    uploads = upload_left(folder, cache(opened), trust=trust)
+    for each in uploads:
+        which = f"run {each.run_id}" if each.run_id else "a run"
+        left = f", the rest is left: {each.left}" if each.left else ""
+        print(printable(f"{which} in {each.folder}: {each.n_entries} entries uploaded{left}"))
+    if not uploads:
+        print(f"{folder}: nothing left to upload")
+    return 1 if any(each.left for each in uploads) else 0
 
 
 @runs.command(epilog=examples("runs reproduce 3bf2 --dry-run", "runs reproduce 3bf2 --out again"))
@@ -228,7 +228,7 @@ def reproduce(run: str, dry_run: bool, out: Path | None, tracking: str, trust: b
     for difference in differences:
         print(printable(f"differs: {difference}"))
     if not differences:
-        print("code, packages, machine and volumes are those that it was made with")
+        print("code, packages, machine and volumes are unchanged")
     if dry_run:
         return 1 if differences else 0
     folder = out or REPRODUCTIONS / f"{original.run.run_id[:8]}-{datetime.now():%Y-%m-%d_%H-%M-%S}"

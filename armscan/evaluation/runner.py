@@ -182,9 +182,9 @@ def _load_weights(agent: Agent, source: TrainedAgent) -> None:
 
 def _without_checkpoint(run: FoundRun) -> str:
     if run.status == "FINISHED":
-        return f"run {run.run_id} has kept no checkpoint, so that there is nothing to evaluate"
+        return f"run {run.run_id} stored no checkpoint: nothing to evaluate"
     ended = "is still running, or was killed" if run.status == "RUNNING" else f"ended before its time ({run.status})"
     return (
-        f"run {run.run_id} {ended}, and a run keeps its checkpoint in the store at its end: go on with it by "
+        f"run {run.run_id} {ended}, and a run keeps its checkpoint in the store at its end: resume it with "
         f"{resume_command(run.run_id, run.uri, trust=run.needs_trust)}"
     )

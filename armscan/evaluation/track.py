@@ -16,7 +16,7 @@ from armscan.evaluation.report import EvaluationReport
 from armscan.evaluation.runner import PreparedAgent
 from armscan.evaluation.volumes import check_out, data_name, file_name
 from armscan.reports.html import page
-from armscan.tracking import TrackedRun, TrackingStore, check_artifacts, deliver_pending, open_store
+from armscan.tracking import TrackedRun, TrackingStore, check_artifacts, open_store, upload_pending
 from armscan.tracking.tags import EVALUATED_TAG
 from armscan.utils.files import atomic_write
 
@@ -53,7 +53,7 @@ def evaluate_and_track(
     source = applied.source
     _check_out(out)
     client, experiment_id = _store_of(source, store)
-    deliver_pending(client)
+    upload_pending(client)
     of, data = source.run.run_id if source.run else source.name, data_name(applied.data)
     facts = {
         "of": of,

@@ -138,7 +138,7 @@ class TrainingVolumes(Mapping[str, LabelVolume]):
             if line is None:
                 raise
             raise InvalidValueError(
-                f"the reward is fitted to the volumes that the agent was trained on, but they are not to be had: {line}"
+                f"the reward is fitted to the volumes that the agent was trained on, but they cannot be read: {line}"
             ) from error
 
     def __getitem__(self, name: str) -> LabelVolume:

@@ -22,7 +22,7 @@ from armscan.utils.files import CONFIG_FILE, LOCK_FILE, OUTBOX_FOLDER, OUTBOX_SU
 
 PARENT_FILE = "parent_run.json"
 OUTCOME_FOLDER = "outcomes"
-NO_OUTCOME, INTERRUPTED = "ended without a word", "interrupted"
+NO_OUTCOME, INTERRUPTED = "ended without an outcome", "interrupted"
 
 
 @dataclass(frozen=True)

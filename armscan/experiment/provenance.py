@@ -18,12 +18,12 @@ from armscan.experiment.build import Experiment
 from armscan.experiment.job import Invocation
 from armscan.tracking import (
     TrackedRun,
-    deliver_pending,
     environment_file,
     environment_tags,
     open_store,
     source,
     tags_of,
+    upload_pending,
 )
 from armscan.tracking.tags import CHOICE, DOMAIN_TAG, FOLDER_TAG, HOST_TAG, JOB_TAG, VERSION_TAG
 from armscan.training import Fingerprints, TrainingDomain
@@ -64,7 +64,7 @@ def start_tracking(
     """
     resolved = to_plain(config)
     client, experiment_id = open_store(**resolved["tracking"], retry_s=retry_s)
-    deliver_pending(client)
+    upload_pending(client)
     choices, job = invocation.choices, invocation.job
     files = provenance_files(resolved, setup)
     # Results of an earlier run in the same folder would be taken for this run's.

@@ -120,7 +120,7 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
     try:
         store, runs = _close_parent(folder, word, status, failed)
     except TrackingError as error:
-        print(f"{error}; {armscan_command('runs', 'sync', str(folder))} delivers the rest", file=sys.stderr)
+        print(f"{error}; {armscan_command('runs', 'sync', str(folder))} uploads the rest", file=sys.stderr)
         store, runs = None, []
     if outcomes:
         from armscan.experiment.console import print_jobs, print_where_to_look

@@ -140,7 +140,7 @@ def _learning(groups: Sequence[Group], curves: Curves) -> Iterator[str]:
         how = HOW_CURVES if is_detailed else f"{HOW_CURVES} {MEANS_ALONE}"
         yield f"<p>{how}</p>{chart(learning_curves(groups, curves, titles, is_detailed=is_detailed))}"
     else:
-        yield "<p>None of these runs has been validated: nothing was to be learned, or nothing has been yet.</p>"
+        yield "<p>None of these runs has been validated: nothing is trained, or nothing validated yet.</p>"
 
 
 def _of_the_training(groups: Sequence[Group], curves: Curves, figures: Sequence[str]) -> Iterator[str]:

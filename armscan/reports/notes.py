@@ -41,12 +41,12 @@ def _on_folds(groups: Sequence[Group]) -> Iterator[str]:
 def _on_seeds(groups: Sequence[Group]) -> Iterator[str]:
     if single := [group.number for group in groups if group.n_seeds == 1]:
         yield (
-            f"{_numbered(single, groups)}: one seed says nothing of how others would go; intervals are of volumes and "
-            "episodes alone."
+            f"{_numbered(single, groups)}: one seed says nothing about other seeds; intervals cover volumes and "
+            "episodes only."
         )
     if few := [group.number for group in groups if 1 < group.n_seeds < MANY_SEEDS]:
         yield (
-            f"{_numbered(few, groups)}: of few seeds the intervals of the final figures are too narrow; those of "
+            f"{_numbered(few, groups)}: with few seeds the intervals of the final figures are too narrow; those of "
             f"curves (from {MIN_SEEDS} seeds on) and of the probabilities below are not."
         )
 

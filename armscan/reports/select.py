@@ -67,7 +67,7 @@ def _meant(store: TrackingStore, name: str) -> list[Run]:
     run = find_run(store, name)
     if EVALUATED_TAG in run.data.tags:
         raise TrackingError(
-            f"run {run.info.run_id} is an evaluation, but runs are compared: give the run that it is of"
+            f"run {run.info.run_id} is an evaluation, but runs are compared: name the run that it evaluates"
         )
     trainings = list(_below(store, run))
     if not trainings:

@@ -53,8 +53,8 @@ class Difference:
     def __str__(self) -> str:
         """Return the difference in one line."""
         if self.largest is None:
-            return f"{self.metric}: none of its {self.n_missing} points is there again"
-        missing = f"; {self.n_missing} points are not there again" if self.n_missing else ""
+            return f"{self.metric}: none of its {self.n_missing} points was reproduced"
+        missing = f"; {self.n_missing} points are missing" if self.n_missing else ""
         if self.largest == 0.0:
             return f"{self.metric}: the same{missing}"
         return (

@@ -53,7 +53,7 @@ class Card:
         reports = _reports(run, folder)
         if not reports:
             command = armscan_command("evaluate", run.run_id, tracking=run.uri, trust=run.needs_trust)
-            text += f"\n\nNothing is known of how good it is: `{command}` says it."
+            text += f"\n\nNot evaluated yet: run `{command}`."
         tags: dict[str, str] = {}
         for title, report in reports.items():
             section = f"\n\n### {title}\n\n{_table(report).markdown()}"

@@ -131,8 +131,8 @@ def _check_kept(run: FoundRun, folder: Path) -> None:
 
 def _not_kept(run: FoundRun) -> ExportError:
     return ExportError(
-        f"run {run.run_id}: its {POLICY_FOLDER}/ is not the one that it has kept: changed, or another run's; remove "
-        "it from its artifacts, and it is made again"
+        f"run {run.run_id}: its {POLICY_FOLDER}/ differs from the one that the run saved: changed, or another run's; "
+        "remove it from the artifacts, and it is exported again"
     )
 
 

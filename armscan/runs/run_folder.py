@@ -15,7 +15,7 @@ from mlflow.entities import Run
 
 from armscan.config.command_hints import armscan_command
 from armscan.errors import ArmscanError, TrackingError
-from armscan.tracking.outbox import DELIVERED, LOCK, SUFFIX, OutboxFile, file_and_place, file_of
+from armscan.tracking.outbox import LOCK, SUFFIX, UPLOADED, OutboxFile, file_and_place, file_of
 from armscan.tracking.tags import FOLDER_TAG, HOST_TAG
 from armscan.utils.files import (
     CONFIG_FILE,
@@ -74,7 +74,7 @@ class OwnFolder:
 
     def files(self) -> dict[Path, int]:
         """Return the run's own files with their sizes in bytes; last, those that prove ownership or lock the folder."""
-        last = [CONFIG_FILE, *(f"{OUTBOX_FOLDER}/{self.run_id}{end}" for end in (DELIVERED, SUFFIX, LOCK)), LOCK_FILE]
+        last = [CONFIG_FILE, *(f"{OUTBOX_FOLDER}/{self.run_id}{end}" for end in (UPLOADED, SUFFIX, LOCK)), LOCK_FILE]
         unfinished = [file.name for file in self.path.glob(f".*.{UNFINISHED}")]
         names = [*unfinished, *RESULTS, *STARTED_WITH, *RECORDS, *self._tracked(), *HYDRA_FILES]
         found = {}
@@ -96,7 +96,7 @@ class OwnFolder:
 
     @contextlib.contextmanager
     def held(self, *, is_planned: bool = False) -> Iterator[None]:
-        """Return a context in which no other process works in the folder or delivers from it.
+        """Return a context in which no other process works in the folder or uploads from it.
 
         Args:
             is_planned: Whether the removal is only planned; a folder without lock files is not locked then. Default:
@@ -111,7 +111,7 @@ class OwnFolder:
                 for lock in (self.path / LOCK_FILE, outbox.with_suffix(LOCK)):
                     if lock.exists() or (lock.parent.is_dir() and not is_planned):
                         stack.enter_context(FileLock(lock, timeout=0))
-                is_delivered = not outbox.exists() or OutboxFile(outbox).is_delivered
+                is_uploaded = not outbox.exists() or OutboxFile(outbox).is_uploaded
             except Timeout as error:
                 raise RunSkippedError(f"another process is using its folder {self.path}") from error
             except TrackingError as error:
@@ -120,7 +120,7 @@ class OwnFolder:
                 raise RunSkippedError(
                     f"it is unknown whether another process is using its folder {self.path} ({error.strerror})"
                 ) from error
-            if not is_delivered:
+            if not is_uploaded:
                 raise RunSkippedError(
                     f"not all of it is uploaded: run {armscan_command('runs', 'sync', str(self.path))}"
                 )

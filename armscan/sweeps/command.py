@@ -61,7 +61,7 @@ def run_study(arguments: Sequence[str], launch: Callable[[Sequence[str]], object
             print_sentence(printable(each.message))
     for phase in opened.phases:
         if phase.scheduler.resume():
-            print(f"{phase.name}: was stopped, and resumes")
+            print(f"{phase.name}: was stopped, resuming")
         if n_failed := phase.scheduler.reset_failures():
             print(f"{phase.name}: {n_failed} failures before this start are ignored")
     try:

@@ -15,7 +15,7 @@ from armscan.tracking.plots import draw_learning_curve
 from armscan.tracking.run import TrackedRun
 from armscan.tracking.sanitize import flattened, tags_of
 from armscan.tracking.store import check_artifacts, check_settings, open_existing_store, open_store
-from armscan.tracking.sync import abandon, deliver_pending, note_end, sync
+from armscan.tracking.sync import abandon, note_end, sync, upload_pending
 
 __all__ = [
     "FoundRun",
@@ -26,7 +26,6 @@ __all__ = [
     "check_run_id",
     "check_settings",
     "check_version",
-    "deliver_pending",
     "draw_learning_curve",
     "environment_file",
     "environment_tags",
@@ -41,4 +40,5 @@ __all__ = [
     "sync",
     "tags_of",
     "take_over",
+    "upload_pending",
 ]

@@ -25,7 +25,7 @@ REFUSED = re.compile(r"[/:.%\"']")
 UNKNOWN = "ENDPOINT_NOT_FOUND"
 
 
-def deliver_model(client: MlflowClient, run_id: str, step: int, metrics: Mapping[str, Sequence[str]]) -> None:
+def upload_model(client: MlflowClient, run_id: str, step: int, metrics: Mapping[str, Sequence[str]]) -> None:
     """Create the model of a run's best checkpoint, or complete an existing one.
 
     Args:

@@ -37,7 +37,7 @@ Entry = dict[str, Any]
 # Uploaded independently: metrics arrive even if the disk of the artifacts is full.
 Channel = Literal["figures", "files"]
 CHANNELS: tuple[Channel, ...] = ("files", "figures")
-DELIVERED, LOCK, SUFFIX = OUTBOX_SUFFIXES
+UPLOADED, LOCK, SUFFIX = OUTBOX_SUFFIXES
 ID = re.compile(r"[\w-]{1,64}", re.ASCII)
 # The run's previous process may still be shutting down.
 LOCK_TIMEOUT_S = 20.0
@@ -71,12 +71,12 @@ class OutboxFile:
 
     def __init__(self, file: Path) -> None:
         self.file = file
-        self._delivered_file = file.with_suffix(DELIVERED)
+        self._uploaded_file = file.with_suffix(UPLOADED)
         try:
             self.address = Address(**next(self.entries())["address"])
         except (StopIteration, TypeError, KeyError) as error:
             raise TrackingError(f"{file}: does not begin with the ID of its run") from error
-        self._delivered: dict[Channel, int] = dict.fromkeys(CHANNELS, 0) | self._read_delivered()
+        self._uploaded: dict[Channel, int] = dict.fromkeys(CHANNELS, 0) | self._read_uploaded()
 
     @property
     def folder(self) -> Path:
@@ -96,7 +96,7 @@ class OutboxFile:
             The entries, and the position behind them, for `mark`.
         """
         entries: list[Entry] = []
-        end = self._delivered[channel]
+        end = self._uploaded[channel]
         with self.file.open("rb") as lines:
             lines.seek(end)
             while len(entries) < at_most and (line := lines.readline()).endswith(b"\n"):
@@ -106,11 +106,11 @@ class OutboxFile:
                     entries.append(entry)
         if not entries:
             # Do not read the other channel's entries again next time.
-            self._delivered[channel] = end
+            self._uploaded[channel] = end
         return entries, end
 
     @property
-    def is_delivered(self) -> bool:
+    def is_uploaded(self) -> bool:
         """Return whether everything is uploaded."""
         return all(not self.next_entries(channel, 1)[0] for channel in CHANNELS)
 
@@ -129,10 +129,10 @@ class OutboxFile:
             raise TrackingError(f"{self.file}: a line of it is damaged: {line[:50]!r}")
         return entry
 
-    def _read_delivered(self) -> dict[Channel, int]:
+    def _read_uploaded(self) -> dict[Channel, int]:
         """Return how far each channel is uploaded; ignore an invalid position, as uploading twice does no harm."""
         try:
-            ends = dict(json.loads(self._delivered_file.read_bytes()))
+            ends = dict(json.loads(self._uploaded_file.read_bytes()))
         except (FileNotFoundError, ValueError, TypeError):
             return {}
         return {channel: ends[channel] for channel in CHANNELS if self._is_end_of_a_line(ends.get(channel))}
@@ -207,9 +207,9 @@ class Outbox(OutboxFile):
 
     def mark(self, channel: Channel, end: int) -> None:
         """Record how far a channel is uploaded."""
-        self._delivered[channel] = end
-        text = json.dumps(self._delivered)
-        atomic_write(self._delivered_file, lambda opened: opened.write(text.encode()))
+        self._uploaded[channel] = end
+        text = json.dumps(self._uploaded)
+        atomic_write(self._uploaded_file, lambda opened: opened.write(text.encode()))
 
     def note(self) -> None:
         """Write this machine's note of the run, so that the next start uploads what is left."""
@@ -253,6 +253,6 @@ def take_over(run_id: str, before: Path, folder: Path) -> None:
     if old.exists():
         new.parent.mkdir(parents=True, exist_ok=True)
         # The order matters little: entries not recorded as uploaded are uploaded again, which changes nothing.
-        if old.with_suffix(DELIVERED).exists():
-            old.with_suffix(DELIVERED).replace(new.with_suffix(DELIVERED))
+        if old.with_suffix(UPLOADED).exists():
+            old.with_suffix(UPLOADED).replace(new.with_suffix(UPLOADED))
         old.replace(new)

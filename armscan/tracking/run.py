@@ -56,7 +56,7 @@ class TrackedRun:
         outbox.note()
         self._uploader = Uploader(outbox, store)
         self._logged = frozenset(logged)
-        self._is_closed, self._is_delivered, self._is_resumed = False, False, False
+        self._is_closed, self._is_uploaded, self._is_resumed = False, False, False
         self._system: SystemMetrics | None = None
         self.run_id = outbox.address.run_id
         self.name = name
@@ -259,7 +259,7 @@ class TrackedRun:
             Whether everything is uploaded; the rest stays in the run's folder.
         """
         if self._is_closed:
-            return self._is_delivered
+            return self._is_uploaded
         self._is_closed = True
         if reason is not None:
             self._add(tags={FAILURE_TAG: reason[:MAX_REASON_CHARS]})
@@ -268,15 +268,15 @@ class TrackedRun:
             self._add(untagged=FAILURE_TAG)
         self._add(status=(status, now_ms()))
         failure = self._uploader.finish(self._store.wait_s if wait_s is None else wait_s)
-        self._is_delivered = failure is None
-        if self._is_delivered:
+        self._is_uploaded = failure is None
+        if self._is_uploaded:
             forget(self.run_id)
         self._outbox.close()
         if failure is not None:
             again = armscan_command("runs", "sync", str(self._outbox.folder))
-            how = "delivers the rest" if self._uploader.is_unavailable else "delivers the rest once the store takes it"
-            log(f"run {self.run_id}: {self._store.uri} has not got all of it ({failure}): {again} {how}")
-        return self._is_delivered
+            how = "uploads the rest" if self._uploader.is_unavailable else "uploads the rest once the store takes it"
+            log(f"run {self.run_id}: {self._store.uri} did not receive everything ({failure}): {again} {how}")
+        return self._is_uploaded
 
     def _add(self, **entry: Any) -> None:
         self._outbox.add(**entry)

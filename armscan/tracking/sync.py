@@ -17,7 +17,7 @@ from armscan.tracking.run import SHORT_WAIT_S, TrackedRun
 from armscan.tracking.sanitize import tags_of
 from armscan.tracking.store import absolute
 from armscan.tracking.tags import FAILURE_TAG, FOLDER_TAG
-from armscan.tracking.uploader import deliver
+from armscan.tracking.uploader import upload
 from armscan.utils.log import log
 
 # Statuses of a run that has ended, as its outbox holds them.
@@ -29,7 +29,7 @@ _looked_for: set[str] = set()
 
 
 @dataclass(frozen=True)
-class Delivery:
+class Upload:
     """Outcome of uploading the entries of a run.
 
     Args:
@@ -45,7 +45,7 @@ class Delivery:
     left: str | None
 
 
-def sync(folder: Path, opened: Callable[[str], TrackingStore], *, trust: bool = False) -> list[Delivery]:
+def sync(folder: Path, opened: Callable[[str], TrackingStore], *, trust: bool = False) -> list[Upload]:
     """Upload the pending entries of all runs in a folder, recursively.
 
     Args:
@@ -64,8 +64,8 @@ def sync(folder: Path, opened: Callable[[str], TrackingStore], *, trust: bool = 
     return _synced([*outbox_files(folder), *removed], opened, trust=trust)
 
 
-def _synced(files: Iterable[Path], opened: Callable[[str], TrackingStore], *, trust: bool) -> list[Delivery]:
-    deliveries: list[Delivery] = []
+def _synced(files: Iterable[Path], opened: Callable[[str], TrackingStore], *, trust: bool) -> list[Upload]:
+    uploads: list[Upload] = []
     stores: dict[str, TrackingStore | TrackingError] = {}
     for file in files:
         run_id = None
@@ -75,21 +75,21 @@ def _synced(files: Iterable[Path], opened: Callable[[str], TrackingStore], *, tr
                 if outbox.status not in ENDED and _is_abandoned(run_id, file):
                     outbox.add(tags={FAILURE_TAG: PROCESS_DIED})
                     outbox.add(status=("FAILED", now_ms()))
-                if outbox.is_delivered:
+                if outbox.is_uploaded:
                     continue
                 if isinstance(store := stores.get(uri) or _opened(opened, uri), TrackingError):
-                    deliveries.append(Delivery(outbox.folder, run_id, 0, str(store)))
+                    uploads.append(Upload(outbox.folder, run_id, 0, str(store)))
                 else:
-                    deliveries.append(_delivered(outbox, store, trust=trust))
+                    uploads.append(_upload_of(outbox, store, trust=trust))
                 stores[uri] = store
         except FileNotFoundError:
             if _is_abandoned(file.stem, file) and (left := _end_removed(file.stem, opened)) is not None:
-                deliveries.append(Delivery(file.parent.parent, file.stem, 0, left))
+                uploads.append(Upload(file.parent.parent, file.stem, 0, left))
         except FolderInUseError:
-            deliveries.append(Delivery(file.parent.parent, None, 0, IN_USE))
+            uploads.append(Upload(file.parent.parent, None, 0, IN_USE))
         except (OSError, TrackingError) as error:
-            deliveries.append(Delivery(file.parent.parent, run_id, 0, str(error)))
-    return deliveries
+            uploads.append(Upload(file.parent.parent, run_id, 0, str(error)))
+    return uploads
 
 
 def _is_abandoned(run_id: str, file: Path) -> bool:
@@ -124,21 +124,21 @@ def _opened(opened: Callable[[str], TrackingStore], uri: str) -> TrackingStore |
         return TrackingError(str(error))
 
 
-def _delivered(outbox: Outbox, store: TrackingStore, *, trust: bool) -> Delivery:
+def _upload_of(outbox: Outbox, store: TrackingStore, *, trust: bool) -> Upload:
     n_entries, left = 0, None
     try:
         if not trust:
             _check_own(outbox, store)
     # Any error of the store, or an untrusted folder.
     except Exception as error:
-        return Delivery(outbox.folder, outbox.address.run_id, 0, reason_in(error))
+        return Upload(outbox.folder, outbox.address.run_id, 0, reason_in(error))
     for channel in CHANNELS:
         try:
-            n_entries += deliver(outbox, store.mlflow, channel, is_whole=False, trust=trust)
+            n_entries += upload(outbox, store.mlflow, channel, is_whole=False, trust=trust)
         # Any error of the store: refused entries stay in the outbox, and the next channel may be accepted.
         except Exception as error:
             left = reason_in(error)
-    return Delivery(outbox.folder, outbox.address.run_id, n_entries, left)
+    return Upload(outbox.folder, outbox.address.run_id, n_entries, left)
 
 
 def _check_own(outbox: Outbox, store: TrackingStore) -> None:
@@ -155,14 +155,14 @@ def _check_own(outbox: Outbox, store: TrackingStore) -> None:
         )
 
 
-def deliver_pending(store: TrackingStore) -> None:
+def upload_pending(store: TrackingStore) -> None:
     """Upload what earlier runs on this machine have left for a store, in the background, once per process."""
     if store.uri not in _looked_for:
         _looked_for.add(store.uri)
-        threading.Thread(target=_deliver_pending, args=(store,), name="pending", daemon=True).start()
+        threading.Thread(target=_upload_pending, args=(store,), name="pending", daemon=True).start()
 
 
-def _deliver_pending(store: TrackingStore) -> None:
+def _upload_pending(store: TrackingStore) -> None:
     def opened(uri: str) -> TrackingStore:
         if uri != store.uri:
             raise TrackingError(f"{uri} is another store")
@@ -170,12 +170,12 @@ def _deliver_pending(store: TrackingStore) -> None:
 
     for run_id, note in notes().items():
         is_there = note.outbox.exists()
-        deliveries = _synced([note.outbox], opened, trust=False)
-        for delivery in deliveries:
-            if delivery.n_entries:
-                log(f"run {delivery.run_id}: {delivery.n_entries} entries that it had left are delivered now")
+        uploads = _synced([note.outbox], opened, trust=False)
+        for each in uploads:
+            if each.n_entries:
+                log(f"run {each.run_id}: uploaded {each.n_entries} entries that it had left")
         # Also forget a removed run of another machine; a run that is in progress keeps its note.
-        if all(delivery.left is None for delivery in deliveries) and (is_there or not note.process.is_here):
+        if all(each.left is None for each in uploads) and (is_there or not note.process.is_here):
             forget(run_id)
 
 

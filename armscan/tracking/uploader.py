@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from armscan.config.trust import TRUST
 from armscan.errors import TrackingError, UntrustedError
 from armscan.tracking.client import NOT_THERE, TrackingStore, reason_in, unavailable_reason
-from armscan.tracking.logged_model import deliver_model
+from armscan.tracking.logged_model import upload_model
 from armscan.tracking.outbox import CHANNELS, Channel, Outbox, file_and_place
 from armscan.tracking.sanitize import MAX_PARAM_CHARS, MAX_TAG_CHARS, shortened
 from armscan.tracking.tags import NOTE_TAG
@@ -101,7 +101,7 @@ class Uploader:
         failure = None
         for channel in CHANNELS:
             try:
-                deliver(self._outbox, self._store.mlflow, channel)
+                upload(self._outbox, self._store.mlflow, channel)
             # Any error of the store: the entries stay in the outbox, and the training goes on.
             except Exception as error:
                 failure = error
@@ -112,13 +112,13 @@ class Uploader:
         before, self._failure = self._failure, failure
         if failure is not None and before is None:
             is_unavailable = unavailable_reason(failure) is not None
-            said = "cannot be reached or written to" if is_unavailable else "refuses what it is given"
-            log(f"{self._store.uri} {said} ({reason_in(failure)}): what is tracked is kept in {self._outbox.file}")
+            said = "cannot be reached or written to" if is_unavailable else "refuses entries"
+            log(f"{self._store.uri} {said} ({reason_in(failure)}): entries are buffered in {self._outbox.file}")
         elif failure is None and before is not None:
-            log(f"{self._store.uri} is back: everything is delivered")
+            log(f"{self._store.uri} is back: everything is uploaded")
 
 
-def deliver(
+def upload(
     outbox: Outbox, client: MlflowClient, channel: Channel, *, is_whole: bool = True, trust: bool = False
 ) -> int:
     """Upload the pending entries of one channel.
@@ -137,11 +137,11 @@ def deliver(
         FileNotFoundError: If a file is missing, and the folder may be an incomplete copy.
         UntrustedError: If a file outside of the run's folder was added by another process, perhaps a stranger's.
     """
-    n_delivered = 0
+    n_uploaded = 0
     while True:
         entries, end = outbox.next_entries(channel, ENTRIES_AT_ONCE if channel == "figures" else 1)
         if not entries:
-            return n_delivered
+            return n_uploaded
         for entry in entries if channel == "files" else ():
             file = outbox.folder / (name := file_and_place(entry["file"])[0])
             if not trust and name not in outbox.added and not file.resolve().is_relative_to(outbox.folder.resolve()):
@@ -149,9 +149,9 @@ def deliver(
             if not is_whole and not file.exists():
                 raise FileNotFoundError(f"{file} is not there")
         for kind, group in itertools.groupby(entries, key=lambda entry: next(iter(entry))):
-            _deliver(client, outbox, kind, [entry[kind] for entry in group])
+            _upload(client, outbox, kind, [entry[kind] for entry in group])
         outbox.mark(channel, end)
-        n_delivered += len(entries)
+        n_uploaded += len(entries)
 
 
 def dataset_input(part: str, prints: Mapping[str, str]) -> DatasetInput:
@@ -170,7 +170,7 @@ def dataset_input(part: str, prints: Mapping[str, str]) -> DatasetInput:
     return DatasetInput(dataset, [InputTag("mlflow.data.context", part)])
 
 
-def _deliver(client: MlflowClient, outbox: Outbox, kind: str, values: list[Any]) -> None:
+def _upload(client: MlflowClient, outbox: Outbox, kind: str, values: list[Any]) -> None:
     from mlflow import entities
     from mlflow.exceptions import MlflowException
 
@@ -207,7 +207,7 @@ def _deliver(client: MlflowClient, outbox: Outbox, kind: str, values: list[Any])
                 client.log_inputs(run_id, [dataset_input(*each) for each in datasets])
         case "model":
             for step, metrics in values:
-                deliver_model(client, run_id, step, metrics)
+                upload_model(client, run_id, step, metrics)
         case "note":
             leave_note(client, run_id, values[-1])
         case "address":

@@ -84,7 +84,9 @@ def load_weights(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
 
     weights, facts = load_checkpoint(path)
     if "reports" in facts:
-        raise CheckpointError(f"{path}: holds all of a training, as last.pt does, not the weights of its best epoch")
+        raise CheckpointError(
+            f"{path}: holds a full training state, as last.pt does, not the best weights"
+        )
     for name, weight in weights.items():
         if isinstance(weight, torch.Tensor) and not torch.isfinite(weight).all():
             raise CheckpointError(f"{path}: holds weights that are not finite, in {name}")

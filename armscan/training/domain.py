@@ -87,8 +87,8 @@ class TrainingDomain:
         """Return the differences that an agent meets on other volumes, one sentence each."""
         notes = []
         for what, here, there, means in (
-            ("a pixel", self.pixel_mm, other.pixel_mm, "images and plain cluster numbers are of another scale"),
-            ("a volume", self.size_mm, other.size_mm, "the same normalised translation goes another way in mm"),
+            ("a pixel", self.pixel_mm, other.pixel_mm, "images and plain cluster numbers have another scale"),
+            ("a volume", self.size_mm, other.size_mm, "the same normalised translation is another distance in mm"),
         ):
             axes = ("across", "in depth" if what == "a pixel" else "along the arm")
             unusual = [

@@ -71,7 +71,7 @@ def headline(results: Mapping[str, MetricEstimates], randoms: Mapping[str, Metri
     name = max(known, key=lambda each: known[each].estimates[limits.metric].value)
     best, random = known[name], randoms.get(name)
     # The highest of several is optimistically biased.
-    which = f"best of {len(known)} on these very volumes, {name}," if len(known) > 1 else name
+    which = f"best of {len(known)}, chosen on these volumes: {name}," if len(known) > 1 else name
     beside = "" if random is None else f", random {_text(random.estimate(limits.metric), '{:.1%}')}"
     far = ", ".join(_text(best.estimates[metric], form) for metric, form in DISTANCES if metric in best.estimates)
     sentences = (

@@ -47,7 +47,7 @@ SHA256_TAGS = {CONFIG_FILE: "config.sha256", VOLUMES_FILE: "volumes.sha256"}
 LOCK_FILE = ".lock"
 # The folder of a run's outbox, in the run's folder.
 OUTBOX_FOLDER = "tracking"
-# Of the files of a run's outbox, named after the run: the delivered position, the lock, and the entries.
+# Of the files of a run's outbox, named after the run: the uploaded position, the lock, and the entries.
 OUTBOX_SUFFIXES = (".delivered.json", ".lock", ".jsonl")
 RUN_ID = "[0-9a-f]" * 32
 UNFINISHED = "unfinished"

@@ -64,14 +64,14 @@ class LabelMap:
             object.__setattr__(self, tissue, _checked_sources(tissue, getattr(self, tissue)))
         for tissue in LANDMARKS:
             if not getattr(self, tissue):
-                raise InvalidValueError(f"labels: {tissue} is empty, but every landmark must be there")
+                raise InvalidValueError(f"labels: {tissue} is empty, but every landmark is required")
         check_choice("labels: others", self.others, (None, "background"))
         seen: dict[Source, str] = {}
         for tissue in TISSUE_LABELS:
             for source in getattr(self, tissue):
                 if source in seen:
                     raise InvalidValueError(
-                        f"labels: {source!r} is {seen[source]} and {tissue}, but it must stand once"
+                        f"labels: {source!r} is {seen[source]} and {tissue}, but it must be listed once"
                     )
                 seen[source] = tissue
 

@@ -210,7 +210,7 @@ def _checked_labels(labels: NDArray[np.generic], name: str) -> NDArray[np.uint8]
     for label in LANDMARK_LABELS:
         if not (checked == label).any():
             raise VolumeError(
-                f"{name}: no voxel is labelled {label} ({LABEL_NAMES[label]}), but every landmark must be there"
+                f"{name}: no voxel is labelled {label} ({LABEL_NAMES[label]}), but every landmark is required"
             )
     checked.flags.writeable = False
     return checked

@@ -4,7 +4,7 @@
 
 The default run, never stopped early, trains with the same seed, and so takes the same steps: untracked, in SQLite, on
 an MLflow server, and on one that stops after the run has begun; in turn, in one process. Tracking takes time in two
-ways: training waits for its own calls (`calls`), and background threads (delivery, system metrics) compute while it
+ways: training waits for its own calls (`calls`), and background threads (upload, system metrics) compute while it
 cannot, at worst for all of their processor time (`threads`). Their sum over the training's wall time is an upper bound
 of the cost. The longest call is the longest single wait.
 """

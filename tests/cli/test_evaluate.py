@@ -29,7 +29,7 @@ def test_evaluate_answers_mistakes_in_one_line(answer, tmp_path, data_folder):
         ([run_id, "--agent=sac", *FEW], f"'{run_id}' cannot be read"),
         ([run_id, "projection=zy"], f"'{run_id} projection=zy' configures an agent: give --agent NAME with it, or RUN"),
         ([run_id, "--projection=zy"], "No such option '--projection'."),
-        (["--agent=random", "agent=sac"], "agent is for armscan run, and not read here: give --agent NAME"),
+        (["--agent=random", "agent=sac"], "agent cannot be set here: give --agent NAME"),
         (["xyz"], "the run is 'xyz', but it must be an id as MLflow shows it"),
         (["ffffffff"], "the run is 'ffffffff', but no run of sqlite:///"),
         ([run_id, "--tracking=sqlite:///no.db"], "tracking.uri is 'sqlite:///no.db', but there is no "),
@@ -55,13 +55,13 @@ def test_evaluate_answers_mistakes_in_one_line(answer, tmp_path, data_folder):
         (["--agent=random", "experiment=x"], "experiment is 'x', but it must be best_full, "),
         (
             ["--agent=random", "tracking.experiment=x"],
-            "tracking.experiment is for armscan run, and not read here: give --tracking-experiment NAME",
+            "tracking.experiment cannot be set here: give --tracking-experiment NAME",
         ),
         (
             ["--agent=random", "+tracking.uri=x"],
-            "tracking.uri is for armscan run, and not read here: give --tracking URI",
+            "tracking.uri cannot be set here: give --tracking URI",
         ),
-        (["--agent=random", "tracking.artifacts=x"], "tracking.artifacts is for armscan run, and not read here"),
+        (["--agent=random", "tracking.artifacts=x"], "tracking.artifacts cannot be set here"),
         (
             ["--agent=random", "evaluation.episodes=5", "--episodes=2"],
             "evaluation.episodes is for armscan run, and not",
@@ -124,7 +124,7 @@ def test_video_answers_mistakes_in_one_line(answer, tmp_path):
         ([run, "--tracking-experiment=x"], "--tracking-experiment is for --agent without --video"),
         (
             ["--agent=sac", "tracking.experiment=x"],
-            "tracking.experiment is for armscan run, and not read here: give --tracking-experiment NAME",
+            "tracking.experiment cannot be set here: give --tracking-experiment NAME",
         ),
         (["--agent=sac", *FEW], "sac has to be trained first: give the RUN that has trained one"),
         ([run, "--out=file"], "--out is 'file', but no video can be written there: "),

@@ -201,7 +201,7 @@ def test_policy_of_another_run_is_not_registered_in_the_place_of_the_kept_one(an
     _, another = registered(answer, tmp_path, "projection=zy")
     before, whole = versions_in(tmp_path), tmp_path / "whole"
     shutil.copytree(model, whole)
-    line = f"error: run {run_id}: its policy/ is not the one that it has kept: changed, or another run's; remove it "
+    line = f"error: run {run_id}: its policy/ differs from the one that the run saved: changed, or another run's; "
 
     def is_refused():
         code, _, errors = answer("register", run_id, "--name=n")

@@ -26,7 +26,7 @@ def legacy(tmp_path, monkeypatch):
     folder = tmp_path / "legacy"
     for file in (folder / "mlruns.sql", folder / "optuna.journal", *folder.glob("runs/*/tracking/*.jsonl")):
         file.write_text(file.read_text().replace("/FOLDER", str(folder)))
-    # The delivered part of an outbox is given in bytes.
+    # The uploaded part of an outbox is given in bytes.
     for file in folder.glob("runs/*/tracking/*.delivered.json"):
         longer = len(str(folder)) - len("/FOLDER")
         file.write_text(json.dumps({name: end + longer for name, end in json.loads(file.read_text()).items()}))

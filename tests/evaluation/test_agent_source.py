@@ -58,12 +58,12 @@ def test_runs_that_have_kept_too_little_are_refused_with_what_to_do(answer, tmp_
     run_id = tracked(tmp_path, kept=())
     assert answer(run_id)[2].startswith(f"error: run {run_id} has no config.yaml among its artifacts, as each")
     run_id = tracked(tmp_path, kept=("config.yaml", "volumes.json"))
-    assert answer(run_id)[2] == (f"error: run {run_id} has kept no checkpoint, so that there is nothing to evaluate")
+    assert answer(run_id)[2] == (f"error: run {run_id} stored no checkpoint: nothing to evaluate")
     client = store_of(tmp_path)
     for status, ended in (("KILLED", "ended before its time (KILLED)"), ("RUNNING", "is still running, or was killed")):
         client.update_run(run_id, status=status)
         assert answer(run_id)[2] == (
-            f"error: run {run_id} {ended}, and a run keeps its checkpoint in the store at its end: go on with it by "
+            f"error: run {run_id} {ended}, and a run keeps its checkpoint in the store at its end: resume it with "
             f"python -m armscan.run resume={run_id}"
         )
 
@@ -82,7 +82,7 @@ def with_nan(weights, facts):
         ),
         (
             lambda weights, facts: (weights, facts | {"reports": "[]"}),
-            "best.pt: holds all of a training, as last.pt does",
+            "best.pt: holds a full training state, as last.pt does",
         ),
         (lambda weights, facts: ({"other": 1}, facts), "the checkpoint is another agent's or network's"),
         (lambda weights, facts: ([1], facts), "best.pt: is not a checkpoint: it contains something other"),

@@ -46,12 +46,12 @@ def test_run_whose_folder_is_full_ends_in_one_line_and_goes_on_when_there_is_spa
     assert_ended_alike(tmp_path)
 
 
-def test_run_goes_on_while_the_disk_of_its_store_is_full_and_sync_delivers_the_rest(disk, tmp_path):
+def test_run_goes_on_while_the_disk_of_its_store_is_full_and_sync_uploads_the_rest(disk, tmp_path):
     words = [*LONGER, f"tracking.uri=sqlite:///{disk.folder}/mlruns.db", "tracking.wait_s=2"]
     code, printed, told = run_until_full(disk, *words, cwd=tmp_path)
     assert (code, told) == (0, "")
     assert "cannot be reached or written to" in printed
-    assert "delivers the rest" in printed
+    assert "uploads the rest" in printed
     with sqlite3.connect(disk.folder / "mlruns.db") as database:
         assert database.execute("PRAGMA integrity_check").fetchone() == ("ok",)
     refused = armscan_run(*LONGER, f"tracking.uri=sqlite:///{disk.folder}/other.db", cwd=tmp_path)

@@ -181,7 +181,7 @@ def moments(drawn):
         Moment("torch:save", 1, drawn.uniform(0.0, 0.003)),
         Moment("armscan.training.checkpoints:save_checkpoint", 2, 900.0),
         Moment(collecting, drawn.randrange(1, 13), soon()),
-        # Between a checkpoint and its entry, and around the delivery of an entry.
+        # Between a checkpoint and its entry, and around the upload of an entry.
         Moment("armscan.tracking.run:TrackedRun.on_epoch"),
         Moment("armscan.tracking.run:TrackedRun.on_epoch", 1, 900.0),
         Moment("mlflow:MlflowClient.log_batch", drawn.randrange(1, 4), 900.0),

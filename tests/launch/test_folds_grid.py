@@ -158,7 +158,7 @@ def test_no_job_is_the_best_of_those_that_are_tested_on_other_wrists():
     }
     assert jobs_table(outcomes, {}).headline == ""
     others = {number: replace(each, varied=f"agent={number}") for number, each in outcomes.items()}
-    assert "best of 2 on these very volumes, 1 (agent=1), 90.0%" in jobs_table(others, {}).headline
+    assert "best of 2, chosen on these volumes: 1 (agent=1), 90.0%" in jobs_table(others, {}).headline
 
 
 def test_table_keeps_kinds_of_runs_apart_and_a_grid_without_folds_has_none(tmp_path):

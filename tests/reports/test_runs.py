@@ -54,7 +54,7 @@ def test_report_of_a_multirun_groups_its_jobs_and_has_every_number_beside_it(ans
     assert "<h1>6 runs</h1>" in shown
     assert all(f"<h2>{heading}</h2>" in shown for heading in SECTIONS)
     assert "6 runs in 2 groups" in shown
-    assert "All groups: of few seeds" in shown
+    assert "All groups: with few seeds" in shown
     table = rows(folder / "runs.csv")
     assert [(row["group"], row["seed"], row["status"]) for row in table] == [
         (f"agent={agent}", str(seed), "finished") for agent in ("sac", "ppo") for seed in range(3)
@@ -97,7 +97,7 @@ def test_one_training_has_a_report_without_bands(answer, runs, tmp_path):
     shown = page(tmp_path / "one")
     assert "1 run in 1 group:" in shown
     assert "sac-cluster-y-phantom<" in shown
-    assert "one seed says nothing of how others would go" in shown
+    assert "one seed says nothing about other seeds" in shown
     assert "<h2>Which is likely" not in shown
     assert {row["low"] for row in rows(tmp_path / "one" / "curves.csv")} == {"nan"}
 
@@ -190,7 +190,7 @@ def test_report_of_runs_answers_mistakes_in_one_line(answer, runs, tmp_path):
         (["--runs=experiment:Default"], "the experiment is 'Default', but in 'sqlite:///"),
         (
             [f"--runs={evaluation}"],
-            f"run {evaluation} is an evaluation, but runs are compared: give the run that it is of",
+            f"run {evaluation} is an evaluation, but runs are compared: name the run that it evaluates",
         ),
         ([f"--runs={other}"], f"run {other} (other) is not an armscan training, and has none below it"),
         (["--runs=a", "--tracking=sqlite:///nowhere.db"], "tracking.uri is 'sqlite:///nowhere.db', but there is no "),

@@ -23,7 +23,7 @@ def test_difference_from_a_run_that_went_on_for_longer_is_none(then):
 def test_difference_names_the_step_where_it_is_largest():
     found = difference("validation/mean_steps", {10: 4.0, 20: 2.0, 30: 1.0}, {10: 4.0, 20: 3.0, 40: 1.0})
     assert (found.largest, found.at_step, found.n_missing, found.n_new) == (1.0, 20, 1, 1)
-    text = "validation/mean_steps: by 1 (50.00%) at step 20, where 2 became 3; 1 points are not there again"
+    text = "validation/mean_steps: by 1 (50.00%) at step 20, where 2 became 3; 1 points are missing"
     assert str(found) == text
 
 

@@ -95,7 +95,7 @@ def test_outbox_that_another_process_holds_is_left(answer, make_run, locked, tmp
 
 
 @WHAT
-def test_what_is_not_delivered_is_left(answer, make_run, tmp_path, what):
+def test_what_is_not_uploaded_is_left(answer, make_run, tmp_path, what):
     run_id = make_run()
     with file_of(tmp_path / "outputs" / "tiny", run_id).open("a") as outbox:
         outbox.write('{"tags": {"a": "b"}}\n')
@@ -296,7 +296,7 @@ def test_run_that_somebody_has_deleted_stays_as_it_is(answer, make_run, store, t
 def test_note_of_a_run_goes_with_its_folder(answer, make_run, monkeypatch, tmp_path):
     monkeypatch.setenv("ARMSCAN_CACHE", str(tmp_path / "cache"))
     run_id = make_run()
-    # As left by a run whose rest was delivered by `armscan runs sync`.
+    # As left by a run whose rest was uploaded by `armscan runs sync`.
     note = tmp_path / "cache" / NOTES_FOLDER / run_id
     note.symlink_to(file_of(tmp_path / "outputs" / "tiny", run_id))
     assert answer("prune", "folders", "--apply")[0] == 0

@@ -90,7 +90,7 @@ def test_reproduce_makes_the_same_again_and_tells_when_a_figure_was_another(made
     ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert ended.stderr == ""
     assert ended.returncode == 0, ended.stdout
-    assert "code, packages, machine and volumes are those that it was made with" in ended.stdout
+    assert "code, packages, machine and volumes are unchanged" in ended.stdout
     (again,) = [each for each in runs_in(folder)[1] if each.info.run_id != run.info.run_id]
     assert again.data.tags["reproduction.of"] == run.info.run_id
     assert again.data.tags["reproduction.is_same"] == "true"

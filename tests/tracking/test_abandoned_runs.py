@@ -11,7 +11,7 @@ from mlflow import MlflowClient
 
 from armscan.tracking import open_existing_store, sync
 from armscan.tracking.notes import NOTES_FOLDER, notes
-from armscan.tracking.sync import FOLDER_REMOVED, PROCESS_DIED, _deliver_pending
+from armscan.tracking.sync import FOLDER_REMOVED, PROCESS_DIED, _upload_pending
 from armscan.utils.processes import ProcessInfo
 
 pytestmark = pytest.mark.full
@@ -54,10 +54,10 @@ def test_run_that_was_killed_is_ended_by_the_next_process(uri, run_id, tmp_path,
     if is_removed:
         shutil.rmtree(tmp_path / "run")
     if who == "a start":
-        _deliver_pending(open_existing_store(uri))
+        _upload_pending(open_existing_store(uri))
         assert notes() == {}
     else:
-        assert not any(delivery.left for delivery in sync(tmp_path, open_existing_store))
+        assert not any(upload.left for upload in sync(tmp_path, open_existing_store))
     assert ending_of(uri, run_id) == ("FAILED", FOLDER_REMOVED if is_removed else PROCESS_DIED)
 
 
@@ -72,5 +72,5 @@ def test_run_of_another_machine_or_of_a_living_process_is_not_ended(uri, run_id,
     if is_removed:
         shutil.rmtree(tmp_path / "run")
     sync(tmp_path, open_existing_store)
-    _deliver_pending(open_existing_store(uri))
+    _upload_pending(open_existing_store(uri))
     assert ending_of(uri, run_id) == ("RUNNING", None)

@@ -106,7 +106,7 @@ def test_best_checkpoint_is_a_model_with_metrics_of_its_run_and_their_volumes_on
     tracked.log_datasets({"test": {"a": "1" * 64}})
     tracked.log_metrics({RATE: 0.5, STEPS: 3.0}, n_env_steps=7)
     for _ in range(2):
-        # As where a server has not answered: an entry is delivered again.
+        # As where a server has not answered: an entry is uploaded again.
         tracked.log_model({"test": [RATE, "test_volumes/none"]}, n_env_steps=7)
     run = run_of(tracked, store)
     client, experiment_id = store()

@@ -25,7 +25,7 @@ def kinds(entries):
     return [next(iter(entry)) for entry in entries]
 
 
-def test_outbox_keeps_entries_in_their_order_and_what_is_delivered_of_each_channel(outbox, tmp_path):
+def test_outbox_keeps_entries_in_their_order_and_what_is_uploaded_of_each_channel(outbox, tmp_path):
     outbox.add(tags={"a": "b"})
     outbox.add(file="best.pt")
     outbox.add(metrics=[("x", 1.0, 5, 100)])
@@ -37,11 +37,11 @@ def test_outbox_keeps_entries_in_their_order_and_what_is_delivered_of_each_chann
     outbox.close()
     again = Outbox.begin(tmp_path, ADDRESS)
     assert again.next_entries("figures", 10)[0] == []
-    assert not again.is_delivered
+    assert not again.is_uploaded
     again.mark("files", again.next_entries("files", 10)[1])
-    assert again.is_delivered
+    assert again.is_uploaded
     again.add(status=("FINISHED", 7))
-    assert (again.is_delivered, again.status) == (False, "FINISHED")
+    assert (again.is_uploaded, again.status) == (False, "FINISHED")
     again.close()
 
 
@@ -99,7 +99,7 @@ def test_outbox_names_a_file_that_does_not_say_what_it_is_of(tmp_path, contents)
     "said",
     ["{", "[]", "5", *(f'{{"figures": {end}, "files": {end}}}' for end in ("99999999", "-5", '"x"', "7", "true"))],
 )
-def test_outbox_delivers_all_again_where_nobody_knows_what_was_delivered(outbox, tmp_path, said):
+def test_outbox_uploads_all_again_where_nobody_knows_what_was_uploaded(outbox, tmp_path, said):
     outbox.mark("figures", outbox.next_entries("figures", 10)[1])
     outbox.file.with_suffix(".delivered.json").write_text(said)
     outbox.close()
@@ -128,7 +128,7 @@ def test_outbox_is_held_by_one_process_until_that_dies(tmp_path):
     Outbox(file_of(tmp_path, ADDRESS.run_id), timeout_s=5.0).close()
 
 
-def test_outbox_is_taken_over_with_what_is_delivered_of_it(outbox, tmp_path):
+def test_outbox_is_taken_over_with_what_is_uploaded_of_it(outbox, tmp_path):
     outbox.add(tags={"a": "b"})
     outbox.mark("figures", outbox.next_entries("figures", 1)[1])
     outbox.close()

@@ -14,7 +14,7 @@ from mlflow import MlflowClient
 
 from armscan.cli.main import main
 from armscan.errors import TrackingError, TrackingUnavailableError
-from armscan.tracking import TrackedRun, abandon, deliver_pending, note_end, open_store, sync, uploader
+from armscan.tracking import TrackedRun, abandon, note_end, open_store, sync, upload_pending, uploader
 from armscan.tracking.client import reason_in, unavailable_reason
 from armscan.tracking.notes import notes
 from armscan.tracking.outbox import file_of
@@ -49,12 +49,12 @@ def histories(uri, run_id):
     return {name: [(point.step, point.value) for point in client.get_metric_history(run_id, name)] for name in names}
 
 
-def test_what_a_run_could_not_deliver_the_next_start_delivers(server, opened, tmp_path, monkeypatch, capfd):
+def test_what_a_run_could_not_upload_the_next_start_uploads(server, opened, tmp_path, monkeypatch, capfd):
     tracked = begun(opened, tmp_path)
     server.stop()
     tracked.log_metrics({"x": 1.0}, n_env_steps=7)
     assert not tracked.end("FINISHED", wait_s=0.1)
-    # A run that is still going on delivers by itself; one whose folder was removed is forgotten.
+    # A run that is still going on uploads by itself; one whose folder was removed is forgotten.
     gone = tmp_path / "gone"
     server.start()
     going_on, removed = begun(opened, tmp_path / "going on"), begun(opened, gone)
@@ -68,7 +68,7 @@ def test_what_a_run_could_not_deliver_the_next_start_delivers(server, opened, tm
     # In the package's namespace, `sync` is the function.
     monkeypatch.setattr(sys.modules["armscan.tracking.sync"], "_looked_for", set())
     for _ in range(2):
-        deliver_pending(opened[0])
+        upload_pending(opened[0])
     wait_until(lambda: tracked.run_id not in notes())
     assert histories(server.uri, tracked.run_id) == {"x": [(7, 1.0)]}
     assert MlflowClient(server.uri).get_run(tracked.run_id).info.status == "FINISHED"
@@ -112,9 +112,9 @@ def test_run_goes_on_while_the_server_is_away_and_nothing_is_lost_or_there_twice
     assert [file.path for file in client.list_artifacts(tracked.run_id)] == ["best.pt"]
     said = [line.partition("  ")[2] for line in capfd.readouterr().out.splitlines()]
     # Once each, and between them at most the line that the end of the run waits.
-    first = f"{server.uri} cannot be reached or written to (Connection refused): what is tracked is kept in "
+    first = f"{server.uri} cannot be reached or written to (Connection refused): entries are buffered in "
     assert said[0] == first + str(file_of(tmp_path, tracked.run_id))
-    assert said[-1] == f"{server.uri} is back: everything is delivered"
+    assert said[-1] == f"{server.uri} is back: everything is uploaded"
     assert len(said) <= 3
 
 
@@ -131,7 +131,7 @@ def test_run_waits_at_its_end_for_a_server_that_comes_back(server, opened, tmp_p
     assert capfd.readouterr().out.count("waiting up to 60 s for http://") == 1
 
 
-def test_run_whose_server_never_comes_back_is_delivered_once_by_track_sync(server, opened, tmp_path, capfd):
+def test_run_whose_server_never_comes_back_is_uploaded_once_by_track_sync(server, opened, tmp_path, capfd):
     store, experiment_id = opened
     store.wait_s = 0.5
     tracked = begun((store, experiment_id), tmp_path)
@@ -141,7 +141,7 @@ def test_run_whose_server_never_comes_back_is_delivered_once_by_track_sync(serve
     tracked.log_metrics({"x": 1.0}, n_env_steps=7)
     try:
         assert not tracked.end("FINISHED")
-        assert f"armscan runs sync {tmp_path} delivers the rest" in capfd.readouterr().out
+        assert f"armscan runs sync {tmp_path} uploads the rest" in capfd.readouterr().out
         assert main(["runs", "sync", str(tmp_path)]) == 1
         assert "the rest is left: tracking.uri is 'http://" in (told := capfd.readouterr().out)
         assert "this store cannot be used: Connection refused" in told
@@ -151,24 +151,24 @@ def test_run_whose_server_never_comes_back_is_delivered_once_by_track_sync(serve
     assert main(["runs", "sync", str(tmp_path)]) == 0
     assert f"run {tracked.run_id} in {tmp_path}: " in capfd.readouterr().out
     assert main(["runs", "sync", str(tmp_path)]) == 0
-    assert "nothing is left to be delivered" in capfd.readouterr().out
+    assert "nothing left to upload" in capfd.readouterr().out
     assert histories(server.uri, tracked.run_id) == {"x": [(7, 1.0)]}
     client = MlflowClient(server.uri)
     assert client.get_run(tracked.run_id).info.status == "FINISHED"
     assert [file.path for file in client.list_artifacts(tracked.run_id)] == ["curve.png"]
 
 
-def test_delivery_whose_answer_is_lost_is_not_there_twice(server, opened, tmp_path, monkeypatch):
+def test_upload_whose_answer_is_lost_is_not_there_twice(server, opened, tmp_path, monkeypatch):
     tracked = begun(opened, tmp_path)
-    deliver, calls = uploader._deliver, Counter()
+    upload, calls = uploader._upload, Counter()
 
     def lost(client, outbox, kind, values):
-        deliver(client, outbox, kind, values)
+        upload(client, outbox, kind, values)
         calls[kind] += 1
         if calls[kind] == 1:
             raise ConnectionResetError(104, "Connection reset by peer")
 
-    monkeypatch.setattr(uploader, "_deliver", lost)
+    monkeypatch.setattr(uploader, "_upload", lost)
     tracked.log_metrics({"x": 1.0, "z": 2.0}, n_env_steps=7)
     tracked.set_tags({"a": "b"})
     assert tracked.end("FINISHED")
@@ -233,7 +233,7 @@ def artifacts_disk(tmp_path):
         yield disk
 
 
-def test_run_ends_where_the_servers_disk_is_full_and_its_files_are_delivered_later(artifacts_disk, tmp_path, capfd):
+def test_run_ends_where_the_servers_disk_is_full_and_its_files_are_uploaded_later(artifacts_disk, tmp_path, capfd):
     with mlflow_server(tmp_path / "server", f"sqlite:///{tmp_path}/runs.db") as server:
         assert server.artifacts == artifacts_disk.folder
         store, experiment_id = open_store(server.uri, experiment="test", artifacts="-", wait_s=20.0)
@@ -261,7 +261,7 @@ def test_run_that_was_deleted_meanwhile_is_not_waited_for(opened, server, tmp_pa
     began_s = time.monotonic()
     assert not tracked.end("FINISHED", wait_s=HANG_S)
     assert time.monotonic() - began_s < HANG_S
-    assert "refuses what it is given" in capfd.readouterr().out
+    assert "refuses entries" in capfd.readouterr().out
 
 
 def test_runs_of_a_dead_process_are_ended_and_those_of_a_living_one_are_not(opened, server, tmp_path):
@@ -277,11 +277,11 @@ def test_runs_of_a_dead_process_are_ended_and_those_of_a_living_one_are_not(open
     assert (run.info.status, run.data.tags["failure"]) == ("FAILED", "its worker died")
     assert histories(server.uri, dead.run_id) == {"x": [(7, 1.0)]}
     assert client.get_run(alive.run_id).info.status == "RUNNING"
-    assert [delivery.left for delivery in sync(tmp_path, lambda _: store)] == ["it is still going on"]
+    assert [upload.left for upload in sync(tmp_path, lambda _: store)] == ["it is still going on"]
     alive.end("FINISHED")
 
 
-def test_sync_goes_on_after_what_it_cannot_deliver(opened, server, tmp_path, capfd):
+def test_sync_goes_on_after_what_it_cannot_upload(opened, server, tmp_path, capfd):
     store, _ = opened
     runs = [begun(opened, tmp_path / name) for name in ("damaged", "elsewhere", "whole")]
     for run in runs:
@@ -297,9 +297,9 @@ def test_sync_goes_on_after_what_it_cannot_deliver(opened, server, tmp_path, cap
     assert "a line of it is damaged: b'nonsense" in told
     assert f"the rest is left: {tmp_path}/elsewhere/best.pt is not there" in told
     assert histories(server.uri, runs[2].run_id) == {"x": [(7, 1.0)]}
-    # An outbox that was copied without its files is not taken for delivered: they may still come.
+    # An outbox that was copied without its files is not taken for uploaded: they may still come.
     (tmp_path / "elsewhere" / "best.pt").write_text("weights")
-    assert [delivery.left for delivery in sync(tmp_path / "elsewhere", lambda _: store, trust=True)] == [None]
+    assert [upload.left for upload in sync(tmp_path / "elsewhere", lambda _: store, trust=True)] == [None]
     files = MlflowClient(server.uri).list_artifacts(runs[1].run_id)
     assert [file.path for file in files] == ["best.pt"]
 

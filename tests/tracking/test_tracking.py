@@ -25,9 +25,9 @@ from armscan.tracking import (
 from armscan.tracking.notes import notes
 from armscan.tracking.outbox import Address, Outbox, file_of
 from armscan.tracking.sanitize import flattened
-from armscan.tracking.sync import _deliver_pending, sync
+from armscan.tracking.sync import _upload_pending, sync
 from armscan.tracking.tags import VERSION_TAG
-from armscan.tracking.uploader import deliver
+from armscan.tracking.uploader import upload
 from armscan.training import EpochReport, TrainingResult
 from tests.support.waiting import wait_until
 from tests.training.test_train import evaluation_of
@@ -117,7 +117,7 @@ def test_tracked_run_keeps_a_folder_with_all_in_it_and_what_makes_it_a_model_las
         assert (Path(kept) / name).read_text() == text
 
 
-def test_folder_that_was_removed_before_it_was_delivered_is_told(store, tmp_path, capsys):
+def test_folder_that_was_removed_before_it_was_uploaded_is_told(store, tmp_path, capsys):
     client, experiment_id = store
     run_id = client.create_run(experiment_id, name="n", tags={}).info.run_id
     outbox = Outbox.begin(tmp_path, Address(run_id, client.uri))
@@ -125,8 +125,8 @@ def test_folder_that_was_removed_before_it_was_delivered_is_told(store, tmp_path
     outbox.add(file="best.pt")
     # If the folder was copied, the file may be elsewhere.
     with pytest.raises(FileNotFoundError, match="policy/MLmodel is not there"):
-        deliver(outbox, client.mlflow, "files", is_whole=False)
-    assert deliver(outbox, client.mlflow, "files") == 2
+        upload(outbox, client.mlflow, "files", is_whole=False)
+    assert upload(outbox, client.mlflow, "files") == 2
     outbox.close()
     said = capsys.readouterr().out
     assert "policy/MLmodel was removed before the store could keep it" in said
@@ -144,21 +144,21 @@ def test_file_outside_of_a_strangers_folder_is_not_uploaded(store, tmp_path, kin
     (folder / "link").symlink_to(tmp_path / "secret")
     outbox.add(file=names[kind])
     outbox.close()
-    (delivery,) = sync(tmp_path, lambda _: client)
-    assert "is outside of the run's folder" in delivery.left
+    (upload,) = sync(tmp_path, lambda _: client)
+    assert "is outside of the run's folder" in upload.left
     assert client.list_artifacts(run_id) == []
     # Nor by a process that resumes the run.
     with contextlib.closing(Outbox.begin(folder, Address(run_id, client.uri))) as outbox:
         outbox.note()
         with pytest.raises(UntrustedError, match="add --trust"):
-            deliver(outbox, client.mlflow, "files")
+            upload(outbox, client.mlflow, "files")
     assert client.list_artifacts(run_id) == []
     # Nor by a later start, though this machine has noted that something is left.
     assert run_id in notes()
-    _deliver_pending(client)
+    _upload_pending(client)
     assert client.list_artifacts(run_id) == []
-    (delivery,) = sync(tmp_path, lambda _: client, trust=True)
-    assert delivery.left is None
+    (upload,) = sync(tmp_path, lambda _: client, trust=True)
+    assert upload.left is None
     assert len(client.list_artifacts(run_id)) == 1
 
 
@@ -170,13 +170,13 @@ def test_strangers_folder_that_names_a_run_of_mine_writes_nothing_to_it(store, t
         outbox.add(tags={"x": "theirs"})
         outbox.add(metrics=[("x", 1.0, 0, 0)])
         outbox.add(status=("FAILED", 1))
-    (delivery,) = sync(tmp_path, lambda _: client)
-    assert "the run was not tracked from here" in delivery.left
-    assert "add --trust" in delivery.left
+    (upload,) = sync(tmp_path, lambda _: client)
+    assert "the run was not tracked from here" in upload.left
+    assert "add --trust" in upload.left
     run = client.get_run(run_id)
     assert (run.info.status, run.data.metrics, run.data.tags.get("x")) == ("RUNNING", {}, None)
-    (delivery,) = sync(tmp_path, lambda _: client, trust=True)
-    assert delivery.left is None
+    (upload,) = sync(tmp_path, lambda _: client, trust=True)
+    assert upload.left is None
     assert client.get_run(run_id).info.status == "FAILED"
 
 

@@ -80,7 +80,7 @@ def test_best_of_several_results_is_named():
     figures = {
         name: MetricEstimates.of(evaluation([rate, rate])) for name, rate in (("0 (a=1)", 0.3), ("1 (a=2)", 0.7))
     }
-    assert headline(figures, {}).startswith("On plane, 5 mm 10°: best of 2 on these very volumes, 1 (a=2), 70.0% (")
+    assert headline(figures, {}).startswith("On plane, 5 mm 10°: best of 2, chosen on these volumes: 1 (a=2), 70.0% (")
 
 
 def test_results_without_the_rate_have_no_headline():

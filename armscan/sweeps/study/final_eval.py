@@ -38,7 +38,7 @@ from armscan.utils.section import Section
 # User attribute of the study of the selection: its settings, for reports.
 FINAL_EVAL = "final_eval"
 # Description of the control.
-NOTHING_SEARCHED = "the configuration of the study without what it searches"
+NOTHING_SEARCHED = "the study's configuration without the searched values"
 ENDED_WITHOUT_SCORE = (TrialState.FAIL, TrialState.PRUNED)
 
 

@@ -163,27 +163,27 @@ def _leaving(opened: OpenedStudy, folder: Path, tracked: TrackedRun, leave_s: fl
                 tracked.set_note(note)
                 where = opened.search.client, opened.search.experiment_id, opened.search.run_id, opened.folder
                 note_run(opened.search.scheduler.study, *where, note)
-        _deliver(opened, tracked, "KILLED" if is_asked else status)
+        _upload(opened, tracked, "KILLED" if is_asked else status)
         for each, handler in before.items():
             signal.signal(each, handler)
     if is_asked:
         raise KeyboardInterrupt
 
 
-def _deliver(opened: OpenedStudy, tracked: TrackedRun, status: str) -> None:
+def _upload(opened: OpenedStudy, tracked: TrackedRun, status: str) -> None:
     """End the study's own run, and upload what its trials buffered while their store was unavailable."""
     is_there = tracked.end(status, wait_s=SHORT_WAIT_S if status == "KILLED" else None)
     left = []
     if is_there:
         # Trusted: anyone who may write into the folder of a study can execute code in it anyway.
-        deliveries = sync(opened.folder, lambda _: opened.search.client, trust=True)
-        left = [each.folder for each in deliveries if each.left]
+        uploads = sync(opened.folder, lambda _: opened.search.client, trust=True)
+        left = [each.folder for each in uploads if each.left]
         with contextlib.suppress(ArmscanError), no_retry():
             for phase in opened.phases:
                 phase.close_orphaned_runs()
     if not is_there or left:
         print(
-            f"not all is tracked: {armscan_command('runs', 'sync', str(opened.folder))} delivers the rest",
+            f"not everything was uploaded: {armscan_command('runs', 'sync', str(opened.folder))} uploads the rest",
             file=sys.stderr,
         )
 
