@@ -25,7 +25,7 @@ from armscan.agents.adam_vectors import AdamVectors, flattened
 from armscan.agents.compute import Compute
 from armscan.agents.mlp_kernels import Layers
 from armscan.agents.replay import Replay
-from armscan.utils.compilation import compilation_told
+from armscan.utils.compilation import log_compilation
 
 # Gradient steps per compiled call: enough to amortise the call, few enough to react to an interrupt quickly.
 N_AT_ONCE = 16
@@ -88,7 +88,7 @@ class CompiledSAC(sac.SAC[Any]):
         transitions = kernels.Transitions(buffer.obs, buffer.obs_next, buffer.act, buffer.rew, buffer.terminated)
         losses = np.empty((n_updates, 5))
         agent, (actor_layers, critic_layers) = self._agent(), self._layers_for(sample_size)
-        compiling_is_told = compilation_told(COMPILING, lambda dispatcher: dispatcher is kernels.update)
+        compiling_is_told = log_compilation(COMPILING, lambda dispatcher: dispatcher is kernels.update)
         with _blas().limit(limits=1), _flushed_denormals(), compiling_is_told:
             for start in range(0, n_updates, N_AT_ONCE):
                 part = losses[start : start + N_AT_ONCE]

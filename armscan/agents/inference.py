@@ -83,14 +83,17 @@ class Inference:
         """
         with torch.no_grad():
             if self._layers is not None:
-                means = torch.from_numpy(_answered(self._layers, np.asarray(observations)))
+                means = torch.from_numpy(_forward(self._layers, np.asarray(observations)))
                 chosen = [self._bounded(mean) for mean in means]
             else:
-                chosen = [self._asked(rows_of(observations, row), int(episode)) for row, episode in enumerate(episodes)]
+                chosen = [
+                    self._action_of_one(rows_of(observations, row), int(episode))
+                    for row, episode in enumerate(episodes)
+                ]
             actions: Rows = torch.stack(chosen).cpu().numpy()
             return actions
 
-    def _asked(self, observation: Observed, episode: int) -> torch.Tensor:
+    def _action_of_one(self, observation: Observed, episode: int) -> torch.Tensor:
         """Return the action for one observation, shape (n_action,)."""
         (means, spreads), _ = self._actor(batch_of([observation]))
         mean, spread = means[0], spreads[0]
@@ -107,7 +110,7 @@ def _layers_of(actor: nn.Module) -> list[nn.Module] | None:
     return layers if all(isinstance(layer, nn.Linear | nn.ReLU) for layer in layers) else None
 
 
-def _answered(layers: Sequence[nn.Module], rows: Rows) -> Rows:
+def _forward(layers: Sequence[nn.Module], rows: Rows) -> Rows:
     for layer in layers:
         if isinstance(layer, nn.Linear):
             rows = linear_rows(rows, layer.weight.detach().numpy(), layer.bias.detach().numpy())

@@ -16,7 +16,7 @@ IMAGE, ACTION = "shares", "action"
 # Units of the outputs: two components of the normal, mm along it, mm across.
 UNITS = (0.1, 0.05, 3.0, 8.0)
 # Units of the places of earlier looks, and the limit that they are clipped to.
-PLACES, MAX_PLACE = (0.2, 0.2, 10.0, 20.0), 6.0
+PLACE_UNITS, MAX_PLACE = (0.2, 0.2, 10.0, 20.0), 6.0
 # Lower bound of expected errors, in mm and degrees: far below real errors, and keeps their logarithm finite.
 MIN_EXPECTED = 0.01
 # Kernel of each convolution; all have stride 2.
@@ -111,7 +111,7 @@ class LookNetwork(nn.Module):
         # This name is part of checkpoints.
         self.doubt = nn.Sequential(nn.Linear(hidden_sizes[-1], 32), nn.ReLU(), nn.Linear(32, 2))
         self.register_buffer("units", torch.tensor(UNITS))
-        self.register_buffer("places", torch.tensor(PLACES))
+        self.register_buffer("places", torch.tensor(PLACE_UNITS))
 
     def forward(
         self, images: Tensor, actions: Tensor, step: Tensor, geometry: PlaneGeometry

@@ -35,7 +35,7 @@ def print_mistake(error: BaseException) -> bool:
 def one_line_message(error: BaseException) -> str | None:
     """Return a user's mistake and the allowed values in one line; None if the error is not a user's mistake."""
     text = " ".join(str(error).split())
-    if (ours := _ours(error)) is not None:
+    if (ours := _armscan_error(error)) is not None:
         return _named(str(ours), text.rpartition("full_key: ")[2])
     match error:
         case MissingConfigException(options=options) if options:
@@ -69,7 +69,7 @@ def _named(message: str, section: str) -> str:
     return message.replace("agent.", f"{section}.") if section.startswith("agent.") else message
 
 
-def _ours(error: BaseException | None) -> ArmscanError | None:
+def _armscan_error(error: BaseException | None) -> ArmscanError | None:
     """Return the first error of armscan in a chain of causes; None if there is none."""
     while error is not None and not isinstance(error, ArmscanError):
         # OmegaConf sets only the context of an error that a resolver has raised, not its cause.

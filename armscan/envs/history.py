@@ -74,7 +74,7 @@ def rows_of(observations: NDArray[Any] | Parts, rows: int | NDArray[Any]) -> NDA
     return observation_of({name: part[rows] for name, part in parts_of(observations).items()})
 
 
-class Remembered(Protocol):
+class EpisodeHistory(Protocol):
     """History of the episodes of a batch of environments, kept by a wrapper.
 
     Arguments and results have a row for each of the environments in `env_ids`, an array of their indices.
@@ -115,12 +115,12 @@ class FrameHistory:
         self.boxes = {**boxes, **{name: self._stacked_box(name, box) for name, box in stacked.items()}}
 
     def refill(self, parts: Parts, infos: Mapping[str, Any], env_ids: EnvIds) -> None:
-        """See `Remembered.refill`."""
+        """See `EpisodeHistory.refill`."""
         for name, frames in self._frames.items():
             frames[env_ids] = parts[name][:, None]
 
     def push(self, parts: Parts, infos: Mapping[str, Any], env_ids: EnvIds) -> None:
-        """See `Remembered.push`."""
+        """See `EpisodeHistory.push`."""
         self._latest[env_ids] = latest = (self._latest[env_ids] + 1) % self._size
         for name, frames in self._frames.items():
             frames[env_ids, latest] = parts[name]

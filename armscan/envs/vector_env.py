@@ -55,9 +55,7 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
         **rules: Any,
     ) -> None:
         if render_mode is not None:
-            raise InvalidValueError(
-                f"render_mode is {render_mode!r}, but only a single environment renders"
-            )
+            raise InvalidValueError(f"render_mode is {render_mode!r}, but only a single environment renders")
         self._set_up(num_envs, _checked_mode(autoreset_mode), lambda: Rules(volumes, **rules))
 
     @classmethod

@@ -18,8 +18,8 @@ from gymnasium.vector.utils import batch_space
 from armscan.envs.history import (
     BestPairs,
     EnvIds,
+    EpisodeHistory,
     FrameHistory,
-    Remembered,
     boxes_of,
     observation_of,
     parts_of,
@@ -36,10 +36,10 @@ Env = gym.Env[Any, FloatArray]
 ONLY = np.array([0])
 
 
-class _Remembering(gym.Wrapper[Any, FloatArray, Any, FloatArray], RecordConstructorArgs):
+class _HistoryWrapper(gym.Wrapper[Any, FloatArray, Any, FloatArray], RecordConstructorArgs):
     """A wrapper that adds an episode's history, kept as for a batch of one environment, to the observation."""
 
-    def __init__(self, env: Env, remembered: Remembered, **arguments: Any) -> None:
+    def __init__(self, env: Env, remembered: EpisodeHistory, **arguments: Any) -> None:
         RecordConstructorArgs.__init__(self, **arguments)
         gym.Wrapper.__init__(self, env)
         self.arguments = arguments
@@ -66,7 +66,7 @@ class _Remembering(gym.Wrapper[Any, FloatArray, Any, FloatArray], RecordConstruc
         return observation_of({name: part[0] for name, part in self.remembered.added_to(parts, ONLY).items()})
 
 
-class FrameStack(_Remembering):
+class FrameStack(_HistoryWrapper):
     """Stacks the last observations, from the oldest to the latest; the first one of an episode fills the stack.
 
     A vector of n numbers becomes one of `stack` * n; in a `Dict` each part gets a leading axis of length `stack`.
@@ -85,7 +85,7 @@ class FrameStack(_Remembering):
         super().__init__(env, FrameHistory(boxes, stack, exclude, 1), stack=stack, exclude=exclude)
 
 
-class BestActionMemory(_Remembering):
+class BestActionMemory(_HistoryWrapper):
     """Adds the best (action, reward) pairs of the episode so far, as `BestPairs` orders them, to the observation.
 
     They are appended to a vector, and become the part `memory` of a `Dict`.
@@ -106,7 +106,7 @@ class BestActionMemory(_Remembering):
 class _VectorRemembering(VectorWrapper):
     """A wrapper that adds each episode's history to its observations."""
 
-    def __init__(self, env: VectorEnv[Any, Any, Any], remembered: Remembered) -> None:
+    def __init__(self, env: VectorEnv[Any, Any, Any], remembered: EpisodeHistory) -> None:
         super().__init__(env)
         self.remembered = remembered
         self.single_observation_space = space_of(remembered.boxes)

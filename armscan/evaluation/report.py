@@ -18,7 +18,7 @@ from armscan.training import Evaluation, MetricEstimates, ResultTable
 from armscan.training.baselines import RANDOM
 from armscan.training.headline import beside_random, headline
 from armscan.training.metric_display import interval_text
-from armscan.training.metrics import MIN_SURE, NOT_STARTED_SOLVED, SUREST
+from armscan.training.metrics import LEAST_SURE, NOT_STARTED_SOLVED, SUREST
 from armscan.utils.rate_text import formatted
 
 TOTAL = "all volumes"
@@ -37,7 +37,7 @@ FURTHER_ROWS = (
 BY_EXPECTED_ERROR = tuple(
     (f"{title} of the {which} quarter, median", f"median_distance_{unit}{suffix}", "{:.2f}")
     for unit, title in (("mm", "distance mm"), ("deg", "angle °"))
-    for which, suffix in (("surest", SUREST), ("least sure", MIN_SURE))
+    for which, suffix in (("surest", SUREST), ("least sure", LEAST_SURE))
 )
 OF_THE_OTHERS = (("success, by reward", "success_rate", "{:.1%}"), ("steps, mean", "mean_steps", "{:.2f}"))
 

@@ -30,7 +30,7 @@ from armscan.training import (
     train,
 )
 from armscan.training.progress import progress_reporter
-from armscan.utils.compilation import compilation_told
+from armscan.utils.compilation import log_compilation
 from armscan.utils.console import print_sentence
 from armscan.utils.files import (
     LAST_CHECKPOINT,
@@ -57,7 +57,7 @@ def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict
     """
     check_keys(config)
     job = invocation.job
-    told = compilation_told(COMPILING, lambda dispatcher: dispatcher.py_func.__module__.startswith(OF_ENVIRONMENT))
+    told = log_compilation(COMPILING, lambda dispatcher: dispatcher.py_func.__module__.startswith(OF_ENVIRONMENT))
     with folder_lock(invocation.folder):
         check_free(invocation.folder)
         with no_garbage_collection():

@@ -85,7 +85,7 @@ def keep_table(table: ResultTable, folder: Path, store: TrackingStore, run_id: s
     from mlflow.entities import Metric
 
     from armscan.tracking.outbox import now_ms
-    from armscan.tracking.uploader import leave_note
+    from armscan.tracking.uploader import set_description
 
     file = folder / RESULTS_PAGE
     text = page("all folds (test)", "".join(f"<p>{html.escape(note)}</p>" for note in notes) + table.html())
@@ -102,4 +102,4 @@ def keep_table(table: ResultTable, folder: Path, store: TrackingStore, run_id: s
     ]
     store.log_batch(run_id, metrics=metrics)
     store.log_artifact(run_id, str(file))
-    leave_note(store, run_id, "\n\n".join([*notes, table.markdown()]))
+    set_description(store, run_id, "\n\n".join([*notes, table.markdown()]))

@@ -48,7 +48,7 @@ class Multirun(Callback):
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Check the addresses that a single run would store."""
-        with _answered():
+        with _exit_on_error():
             for key in (TRACKING_URI, "study.storage"):
                 if isinstance(uri := OmegaConf.select(config, key), str):
                     check_address(key, uri)
@@ -56,7 +56,7 @@ class Multirun(Callback):
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Open the store, start the parent run and write its ID for the jobs."""
         self.on_run_start(config)
-        with _answered():
+        with _exit_on_error():
             self._start(config)
 
     @staticmethod
@@ -89,7 +89,7 @@ class Multirun(Callback):
 
 
 @contextmanager
-def _answered() -> Iterator[None]:
+def _exit_on_error() -> Iterator[None]:
     """Report an error in one line and exit: Hydra only warns of a callback's exception, and starts the jobs."""
     try:
         yield
@@ -180,13 +180,13 @@ def _keep_tables(
 def _keep_page(table: ResultTable, folder: Path, word: Mapping[str, Any], store: TrackingStore) -> None:
     """Save the table of the jobs as a page, in the grid's folder and with its parent run."""
     from armscan.reports.html import page
-    from armscan.tracking.uploader import leave_note
+    from armscan.tracking.uploader import set_description
 
     file, n_jobs = folder / RESULTS_PAGE, sum(map(bool, table.facts["outcome"]))
     body = f"<p><code>{html.escape(' '.join(word['overrides']))}</code></p>{table.html()}"
     atomic_write(file, methodcaller("write", page(f"Grid of {n_jobs} job{'s' if n_jobs > 1 else ''}", body).encode()))
     store.log_artifact(word["run_id"], str(file))
-    leave_note(store, word["run_id"], table.markdown())
+    set_description(store, word["run_id"], table.markdown())
 
 
 def _pool_folds(

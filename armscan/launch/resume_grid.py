@@ -39,18 +39,18 @@ def run_again(config: DictConfig, invocation: Invocation, job: Job) -> Metrics:
     for run in earlier:
         if run.info.status == "FINISHED":
             print(f"[{job.label}] has finished before: run {run.info.run_id}", flush=True)
-            _adopt(client, run, job)
+            _set_parent(client, run, job)
             return _metrics_of(run)
     for run in earlier:
         folder = run.data.tags.get(FOLDER_TAG)
         if run.info.status != "RUNNING" and folder is not None and (Path(folder) / LAST_CHECKPOINT).exists():
-            _adopt(client, run, job)
+            _set_parent(client, run, job)
             # Trusted, because its configuration is this job's.
             return resume_run(client, run.info.run_id, job_label=job.label, trust=True)
     return run_experiment(config, invocation)
 
 
-def _adopt(client: TrackingStore, run: Run, job: Job) -> None:
+def _set_parent(client: TrackingStore, run: Run, job: Job) -> None:
     """Make a run a child of the grid that is repeated."""
     client.set_tag(run.info.run_id, PARENT_TAG, job.parent_run_id)
     client.set_tag(run.info.run_id, JOB_TAG, str(job.number))

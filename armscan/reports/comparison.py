@@ -112,7 +112,7 @@ def _summary(groups: Sequence[Group]) -> str:
     rows = [
         {
             "group": Markup(f'<span style="color: {colour}">●</span> {html.escape(group.title)}'),
-            "runs, with their seeds": ", ".join(f"{each.id} ({_told(each)})" for each in group.trainings),
+            "runs, with their seeds": ", ".join(f"{each.id} ({_seed_and_fold(each)})" for each in group.trainings),
             "environment steps": _span([training.env_steps for training in group.trainings]),
             "training, s": _span([training.wall_s for training in group.trainings]),
         }
@@ -122,7 +122,7 @@ def _summary(groups: Sequence[Group]) -> str:
     return f"<p>{counted}: those of a group differ by nothing but {by}.</p>{table(rows, what='groups')}"
 
 
-def _told(training: TrackedTraining) -> str:
+def _seed_and_fold(training: TrackedTraining) -> str:
     """Return the seed of a training, and the fold that it was tested on."""
     seed = training.seed or "–"
     return seed if training.fold is None else f"{seed}, fold {training.fold}"

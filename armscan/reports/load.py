@@ -15,7 +15,7 @@ from mlflow.store.artifact.artifact_repository_registry import get_artifact_repo
 from armscan.config.defaults import FOLD, FOLDS
 from armscan.config.legacy import migrate
 from armscan.errors import TrackingError
-from armscan.reports.select import SelectedRuns
+from armscan.reports.select import SelectedRun
 from armscan.stats.on_plane import leading_of, limits_among
 from armscan.tracking import TrackingStore
 from armscan.tracking.histories import History, metric_histories
@@ -138,7 +138,7 @@ def validation_titles(names: Iterable[str]) -> dict[str, str]:
     return titles | {name: title for name, title in VALIDATION.items() if name in known}
 
 
-def read_trainings(store: TrackingStore, found: Sequence[SelectedRuns], folder: Path) -> list[TrackedTraining]:
+def read_trainings(store: TrackingStore, found: Sequence[SelectedRun], folder: Path) -> list[TrackedTraining]:
     """Load the trainings of runs.
 
     Args:
@@ -156,7 +156,7 @@ def read_trainings(store: TrackingStore, found: Sequence[SelectedRuns], folder: 
     return [_training(each, histories[each.run.info.run_id], of_run) for each, of_run in zip(found, files, strict=True)]
 
 
-def _training(found: SelectedRuns, histories: Mapping[str, History], files: Mapping[str, bytes]) -> TrackedTraining:
+def _training(found: SelectedRun, histories: Mapping[str, History], files: Mapping[str, bytes]) -> TrackedTraining:
     run, tags = found.run, found.run.data.tags
     series = _series(histories)
     evaluation = _parsed(run, files, EVALUATION_FILE, lambda contents: Evaluation.of_dict(contents[TEST]))

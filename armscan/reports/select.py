@@ -19,7 +19,7 @@ N_SHOWN = 6
 
 
 @dataclass(frozen=True)
-class SelectedRuns:
+class SelectedRun:
     """A training that was found.
 
     Args:
@@ -45,7 +45,7 @@ def read_runs(text: str) -> list[str]:
     return list(dict.fromkeys(named))
 
 
-def find_trainings(store: TrackingStore, named: Sequence[str]) -> list[SelectedRuns]:
+def find_trainings(store: TrackingStore, named: Sequence[str]) -> list[SelectedRun]:
     """Return the named trainings, each once: in the order of the names, then of their starts.
 
     Args:
@@ -103,7 +103,7 @@ def _in_experiment(store: TrackingStore, name: str) -> list[Run]:
     return trainings
 
 
-def _selected(store: TrackingStore, runs: Sequence[Run]) -> list[SelectedRuns]:
+def _selected(store: TrackingStore, runs: Sequence[Run]) -> list[SelectedRun]:
     """Return the trainings, each with whether its trial was pruned."""
     for run in runs:
         check_version(run)
@@ -117,4 +117,4 @@ def _selected(store: TrackingStore, runs: Sequence[Run]) -> list[SelectedRuns]:
         for experiment_id in {experiment_id for experiment_id, _ in trials.values()}
         for each in store.runs([experiment_id], f"tags.`{PRUNED_TAG}` IS NOT NULL")
     }
-    return [SelectedRuns(run, trials.get(run.info.run_id) in pruned) for run in runs]
+    return [SelectedRun(run, trials.get(run.info.run_id) in pruned) for run in runs]

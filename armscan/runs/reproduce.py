@@ -20,7 +20,7 @@ from armscan.experiment.provenance import CHOICES_IN_TAGS, start_tracking
 from armscan.experiment.runner import run_tracked
 from armscan.runs.compare import Comparison, compare_runs
 from armscan.tracking import FoundRun, environment_tags, load_run, source
-from armscan.tracking.environment import COMMIT, CONSTRAINTS_SUM, DIFF_SUM, DIRTY, TOLD, environment
+from armscan.tracking.environment import COMMIT, CONSTRAINTS_SUM, DIFF_SUM, DIRTY, REPORTED_PACKAGES, environment
 from armscan.tracking.sync import ENDED
 from armscan.tracking.tags import CHOICE, EVALUATED_TAG
 from armscan.training import check_unchanged
@@ -104,8 +104,8 @@ def differences(original: Original) -> list[str]:
     packages = sorted((before["packages"].keys() | here["packages"].keys()) - {"armscan"})
     pairs = {name: [each["packages"].get(name, "not installed") for each in (before, here)] for name in packages}
     changed = {name: f"{name} was {then}, and is {now}" for name, (then, now) in pairs.items() if then != now}
-    lines += [line for name, line in changed.items() if name in TOLD]
-    if others := [name for name in changed if name not in TOLD]:
+    lines += [line for name, line in changed.items() if name in REPORTED_PACKAGES]
+    if others := [name for name in changed if name not in REPORTED_PACKAGES]:
         shown = ", ".join(others[:N_SHOWN]) + (", ..." if len(others) > N_SHOWN else "")
         lines.append(f"{len(others)} other packages have other versions, or are there in one case only: {shown}")
     return lines

@@ -10,7 +10,7 @@ from typing import NamedTuple
 from armscan.errors import InvalidValueError
 from armscan.utils.validation import check_numbers
 
-WANTED = "a list of different pairs [mm, degrees], each above 0, such as [[5, 10], [2, 5]]"
+EXPECTED = "a list of different pairs [mm, degrees], each above 0, such as [[5, 10], [2, 5]]"
 PREFIX = "on_plane_"
 
 
@@ -61,10 +61,10 @@ def check_on_plane(name: str, limits: object) -> tuple[OnPlane, ...]:
         InvalidValueError: If they are not a list, or empty, or an item is not a pair, not above 0, or there twice.
     """
     if not isinstance(limits, Sequence) or isinstance(limits, str) or not limits:
-        raise InvalidValueError(f"{name} is {limits!r}, but it must be {WANTED}")
+        raise InvalidValueError(f"{name} is {limits!r}, but it must be {EXPECTED}")
     pairs = [OnPlane(*check_numbers(name, pair, 2, "(mm, degrees) each")) for pair in limits]
     if min(min(pair) for pair in pairs) <= 0.0 or len({pair.metric for pair in pairs}) < len(pairs):
-        raise InvalidValueError(f"{name} is {limits!r}, but it must be {WANTED}")
+        raise InvalidValueError(f"{name} is {limits!r}, but it must be {EXPECTED}")
     return tuple(pairs)
 
 

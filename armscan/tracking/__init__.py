@@ -13,7 +13,7 @@ from armscan.tracking.lookup import (
 from armscan.tracking.outbox import take_over
 from armscan.tracking.plots import draw_learning_curve
 from armscan.tracking.run import TrackedRun
-from armscan.tracking.sanitize import flattened, tags_of
+from armscan.tracking.sanitize import flatten, tags_of
 from armscan.tracking.store import check_artifacts, check_settings, open_existing_store, open_store
 from armscan.tracking.sync import abandon, note_end, sync, upload_pending
 
@@ -30,7 +30,7 @@ __all__ = [
     "environment_file",
     "environment_tags",
     "find_run",
-    "flattened",
+    "flatten",
     "load_run",
     "note_end",
     "open_existing_store",

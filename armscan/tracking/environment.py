@@ -23,7 +23,18 @@ from packaging.utils import canonicalize_name
 from armscan.utils.files import sha256
 
 # Packages that a run's results may depend on; the environment file has the versions of all.
-TOLD = ("torch", "tianshou", "gymnasium", "numpy", "numba", "scipy", "simpleitk", "optuna", "mlflow", "hydra-core")
+REPORTED_PACKAGES = (
+    "torch",
+    "tianshou",
+    "gymnasium",
+    "numpy",
+    "numba",
+    "scipy",
+    "simpleitk",
+    "optuna",
+    "mlflow",
+    "hydra-core",
+)
 PACKAGE_FOLDERS = {"site-packages", "dist-packages"}
 PYTHON, CONSTRAINTS_SUM = "version.python", "constraints.sha256"
 UNKNOWN = "unknown"
@@ -69,7 +80,7 @@ def environment_tags() -> dict[str, str]:
     constraints = Path(__file__).parents[2] / "constraints.txt"
     return {
         PYTHON: environment()["python"],
-        **{f"version.{name}": packages.get(name, "not installed") for name in TOLD},
+        **{f"version.{name}": packages.get(name, "not installed") for name in REPORTED_PACKAGES},
         # Only a clone has this file, a wheel does not.
         CONSTRAINTS_SUM: sha256(constraints.read_bytes()) if constraints.is_file() else UNKNOWN,
     }

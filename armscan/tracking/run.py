@@ -86,12 +86,12 @@ class TrackedRun:
         """
         parent = {PARENT_TAG: parent_id} if parent_id else {}
         run = store.create_run(experiment_id, name=name, tags={**source().tags, **tags, **parent})
-        tracked = cls.joined(store, run.info.run_id, name=name, folder=folder)
+        tracked = cls.open_existing(store, run.info.run_id, name=name, folder=folder)
         tracked._log_config(config)
         return tracked
 
     @classmethod
-    def joined(cls, store: TrackingStore, run_id: str, *, name: str, folder: Path) -> Self:
+    def open_existing(cls, store: TrackingStore, run_id: str, *, name: str, folder: Path) -> Self:
         """Open an existing run to add to it."""
         return cls(store, Outbox.begin(folder, Address(run_id, store.uri)), name=name)
 

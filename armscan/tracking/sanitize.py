@@ -20,21 +20,21 @@ N_SUM_CHARS = 8
 
 def params_of(config: Mapping[str, Any]) -> dict[str, str]:
     """Return the leaves of a configuration as MLflow parameters; a truncated value names the file with all of it."""
-    leaves = flattened(config)
-    return {name_of(key): shortened(str(value), MAX_PARAM_CHARS, CONFIG_FILE) for key, value in leaves.items()}
+    leaves = flatten(config)
+    return {name_of(key): truncate(str(value), MAX_PARAM_CHARS, CONFIG_FILE) for key, value in leaves.items()}
 
 
 def tags_of(tags: Mapping[str, str], whole_in: str = CONFIG_FILE) -> dict[str, str]:
     """Return tags as MLflow accepts them; a truncated value names the file with all of it."""
-    return {name_of(key): shortened(value, MAX_TAG_CHARS, whole_in) for key, value in tags.items()}
+    return {name_of(key): truncate(value, MAX_TAG_CHARS, whole_in) for key, value in tags.items()}
 
 
-def flattened(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Return the leaves of nested mappings by their dotted keys; lists are leaves, written as JSON."""
     leaves: dict[str, Any] = {}
     for key, value in config.items():
         if isinstance(value, Mapping) and value:
-            leaves |= flattened(value, f"{prefix}{key}.")
+            leaves |= flatten(value, f"{prefix}{key}.")
         else:
             leaves[f"{prefix}{key}"] = json.dumps(value) if isinstance(value, list | dict) else value
     return leaves
@@ -48,7 +48,7 @@ def name_of(key: str) -> str:
     return f"{name[: MAX_KEY_CHARS - N_SUM_CHARS - 1]}-{hashlib.sha256(key.encode()).hexdigest()[:N_SUM_CHARS]}"
 
 
-def shortened(text: str, at_most: int, whole_in: str) -> str:
+def truncate(text: str, at_most: int, whole_in: str) -> str:
     """Return a string of at most `at_most` characters; a truncated one ends by naming the file with all of it."""
     if len(text) <= at_most:
         return text

@@ -14,7 +14,7 @@ from armscan.errors import TrackingError, UntrustedError
 from armscan.tracking.client import NOT_THERE, TrackingStore, reason_in, unavailable_reason
 from armscan.tracking.logged_model import upload_model
 from armscan.tracking.outbox import CHANNELS, Channel, Outbox, file_and_place
-from armscan.tracking.sanitize import MAX_PARAM_CHARS, MAX_TAG_CHARS, shortened
+from armscan.tracking.sanitize import MAX_PARAM_CHARS, MAX_TAG_CHARS, truncate
 from armscan.tracking.tags import NOTE_TAG
 from armscan.utils.files import RESULTS_PAGE, VOLUMES_FILE, sha256
 from armscan.utils.log import log
@@ -165,7 +165,7 @@ def dataset_input(part: str, prints: Mapping[str, str]) -> DatasetInput:
 
     digest = sha256("".join(sorted(prints.values())).encode())[:DIGEST_CHARS]
     profile = json.dumps({"volumes": len(prints)})
-    source = shortened(" ".join(prints), MAX_PARAM_CHARS, VOLUMES_FILE)
+    source = truncate(" ".join(prints), MAX_PARAM_CHARS, VOLUMES_FILE)
     dataset = Dataset(f"{part} volumes", digest, "armscan", json.dumps({"volumes": source}), profile=profile)
     return DatasetInput(dataset, [InputTag("mlflow.data.context", part)])
 
@@ -209,16 +209,16 @@ def _upload(client: MlflowClient, outbox: Outbox, kind: str, values: list[Any]) 
             for step, metrics in values:
                 upload_model(client, run_id, step, metrics)
         case "note":
-            leave_note(client, run_id, values[-1])
+            set_description(client, run_id, values[-1])
         case "address":
             return
         case _:
             raise TrackingError(f"{outbox.file}: holds {kind!r}, which this version of armscan does not know")
 
 
-def leave_note(client: MlflowClient | TrackingStore, run_id: str, text: str) -> None:
+def set_description(client: MlflowClient | TrackingStore, run_id: str, text: str) -> None:
     """Set the description of a run, unless a person has written one."""
-    text = shortened(text, MAX_TAG_CHARS, RESULTS_PAGE)
+    text = truncate(text, MAX_TAG_CHARS, RESULTS_PAGE)
     tags = client.get_run(run_id).data.tags
     if NOTE_TAG not in tags or sha256(tags[NOTE_TAG].encode()) == tags.get(NOTE_SUM_TAG):
         client.set_tag(run_id, NOTE_TAG, text)

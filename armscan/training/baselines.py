@@ -51,11 +51,11 @@ def evaluate_baselines(
     evaluations = {}
     for name, agent in agents.items():
         file = _file(name, rules, n_episodes, seed) if rules else None
-        evaluation = _kept(file) if file else None
+        evaluation = _cached(file) if file else None
         if evaluation is None:
             evaluation = evaluate(agent, env, n_episodes=n_episodes, seed=seed)
             if file:
-                _keep(evaluation, file)
+                _cache(evaluation, file)
         evaluations[name] = Evaluation(evaluation.episodes, on_plane)
     return evaluations
 
@@ -84,7 +84,7 @@ def _file(name: str, rules: str, n_episodes: int, seed: int) -> Path:
     return cache_folder() / FOLDER / f"{digest[:32]}.json"
 
 
-def _kept(file: Path) -> Evaluation | None:
+def _cached(file: Path) -> Evaluation | None:
     try:
         return Evaluation.of_plain(json.loads(file.read_bytes()))
     except (OSError, ValueError):
@@ -92,7 +92,7 @@ def _kept(file: Path) -> Evaluation | None:
         return None
 
 
-def _keep(evaluation: Evaluation, file: Path) -> None:
+def _cache(evaluation: Evaluation, file: Path) -> None:
     text = json.dumps([asdict(episode) for episode in evaluation.episodes]).encode()
     # A cache that cannot be written only costs time.
     with contextlib.suppress(OSError):

@@ -84,9 +84,7 @@ def load_weights(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
 
     weights, facts = load_checkpoint(path)
     if "reports" in facts:
-        raise CheckpointError(
-            f"{path}: holds a full training state, as last.pt does, not the best weights"
-        )
+        raise CheckpointError(f"{path}: holds a full training state, as last.pt does, not the best weights")
     for name, weight in weights.items():
         if isinstance(weight, torch.Tensor) and not torch.isfinite(weight).all():
             raise CheckpointError(f"{path}: holds weights that are not finite, in {name}")
@@ -113,10 +111,10 @@ def _verified(file: io.BufferedReader, path: Path) -> BinaryIO:
         )
     if hashlib.file_digest(file, "sha256").hexdigest().encode() != match[2]:
         raise CheckpointError(f"{path}: is damaged: its contents are not those that were written")
-    return cast(BinaryIO, _After(file, len(header)))
+    return cast(BinaryIO, _OffsetFile(file, len(header)))
 
 
-class _After(io.RawIOBase):
+class _OffsetFile(io.RawIOBase):
     """An open file from an offset on, as if it began there; torch counts positions from a file's beginning."""
 
     def __init__(self, file: io.BufferedReader, offset: int) -> None:

@@ -17,7 +17,7 @@ from armscan.training.episode_results import MEANS, EpisodeResult, Evaluation
 # Suffix of metrics over the episodes that did not start solved, and of rates with Wilson's interval.
 NOT_STARTED_SOLVED, WILSON = "_not_started_solved", "_wilson"
 # Suffixes of errors over the episodes with the smallest and with the largest expected errors.
-SUREST, MIN_SURE = "_surest_quarter", "_least_sure_quarter"
+SUREST, LEAST_SURE = "_surest_quarter", "_least_sure_quarter"
 # Suffixes of the ends of an interval, and the names of the counts.
 ENDS = ("_low", "_high")
 COUNTS = ("volumes", "episodes", "episodes_started_solved")
@@ -158,7 +158,7 @@ def _by_expected_error(episodes: Sequence[EpisodeResult]) -> dict[str, tuple[Sta
             return {}
         order = np.argsort(expected, kind="stable")
         n_quarter = math.ceil(len(order) / 4)
-        for which, chosen in ((SUREST, order[:n_quarter]), (MIN_SURE, order[-n_quarter:])):
+        for which, chosen in ((SUREST, order[:n_quarter]), (LEAST_SURE, order[-n_quarter:])):
             values = np.full(len(order), math.nan)
             values[chosen] = [getattr(episodes[index], f"distance_{unit}") for index in chosen]
             columns[f"median_distance_{unit}{which}"] = MEDIAN, values.tolist()

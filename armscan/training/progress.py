@@ -28,7 +28,7 @@ def progress_reporter(label: str | None = None, measured: str = "validation") ->
     return ProgressBar(measured) if label is None and sys.stdout.isatty() else ProgressLines(label, measured)
 
 
-class _Narrower(Progress):
+class _NarrowProgress(Progress):
     """A bar that leaves the terminal's last columns free: the echo of Ctrl-C would wrap to the next line there."""
 
     def get_renderable(self) -> RenderableType:
@@ -47,7 +47,7 @@ class ProgressBar:
         self._measured = measured
         # On a narrow terminal the numbers keep their width; the bar shrinks.
         fixed = Column(no_wrap=True)
-        self._progress = _Narrower(
+        self._progress = _NarrowProgress(
             BarColumn(bar_width=None, table_column=Column(ratio=1, min_width=4)),
             *(MofNCompleteColumn(table_column=fixed), TextColumn("{task.fields[metrics]}", table_column=fixed)),
             TimeRemainingColumn(table_column=fixed),

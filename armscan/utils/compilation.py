@@ -72,23 +72,23 @@ def _sources_sha256() -> str:
 
 
 @contextmanager
-def compilation_told(text: str, is_meant: Callable[[Any], bool]) -> Iterator[None]:
+def log_compilation(text: str, matches: Callable[[Any], bool]) -> Iterator[None]:
     """Log a text once inside the context, when Numba begins to compile a function that its cache does not have.
 
     Args:
         text: Text to log.
-        is_meant: Function that returns whether a Numba dispatcher is among the functions that the text is about.
+        matches: Function that returns whether a Numba dispatcher is among the functions that the text is about.
     """
-    with install_listener("numba:compile", _Note(text, is_meant)):
+    with install_listener("numba:compile", _Note(text, matches)):
         yield
 
 
 class _Note(Listener):
-    def __init__(self, text: str, is_meant: Callable[[Any], bool]) -> None:
-        self._text, self._is_meant, self._is_told = text, is_meant, False
+    def __init__(self, text: str, matches: Callable[[Any], bool]) -> None:
+        self._text, self._matches, self._is_told = text, matches, False
 
     def on_start(self, event: Event) -> None:
-        if not self._is_told and self._is_meant(event.data["dispatcher"]):
+        if not self._is_told and self._matches(event.data["dispatcher"]):
             self._is_told = True
             log(self._text)
 

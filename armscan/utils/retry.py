@@ -63,7 +63,7 @@ class RetryPolicy:
                 raise
         if getattr(_this_thread, "no_retry", False):
             raise self._error(f"{self._named}, but it is unavailable: {reason}") from cause
-        with self._told(reason):
+        with self._log_outage(reason):
             return self._waited(operate, reason, cause)
 
     def _waited(self, operate: Callable[[], T], reason: str, cause: Exception) -> T:
@@ -84,7 +84,7 @@ class RetryPolicy:
         raise self._error(f"{self._named}, but it has been unavailable for {long}: {reason}") from cause
 
     @contextmanager
-    def _told(self, reason: str) -> Iterator[None]:
+    def _log_outage(self, reason: str) -> Iterator[None]:
         """Log once that threads wait for the service, and once that it is back."""
         with self._changing:
             self._n_waiting += 1

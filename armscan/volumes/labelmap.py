@@ -97,7 +97,7 @@ class LabelMap:
 
 
 @dataclass(frozen=True)
-class Found:
+class FoundSource:
     """A value or segment found in a file.
 
     Args:
@@ -113,7 +113,7 @@ class Found:
 
 def map_values(
     values: NDArray[np.generic], labels: LabelMap | None, where: str
-) -> tuple[NDArray[np.uint8], tuple[Found, ...]]:
+) -> tuple[NDArray[np.uint8], tuple[FoundSource, ...]]:
     """Map a file's values to the labels 0 to 4.
 
     Args:
@@ -141,7 +141,7 @@ def map_values(
             "must be background"
         )
     named = {value: label for value, label in table.items() if label is not None}
-    return replaced(whole, named), tuple(Found(value, named[value], counts[value]) for value in counts)
+    return apply_table(whole, named), tuple(FoundSource(value, named[value], counts[value]) for value in counts)
 
 
 def count_values(values: NDArray[np.integer[Any]]) -> dict[int, int]:
@@ -157,7 +157,7 @@ def count_values(values: NDArray[np.integer[Any]]) -> dict[int, int]:
     return {low + int(position): int(counts[position]) for position in np.flatnonzero(counts)}
 
 
-def replaced(values: NDArray[np.integer[Any]], table: Mapping[int, int]) -> NDArray[np.uint8]:
+def apply_table(values: NDArray[np.integer[Any]], table: Mapping[int, int]) -> NDArray[np.uint8]:
     """Return the label that `table` gives for each value; every value that occurs must be in it."""
     known = sorted(table)
     low, high = known[0], known[-1]
@@ -172,7 +172,7 @@ def replaced(values: NDArray[np.integer[Any]], table: Mapping[int, int]) -> NDAr
     return mapped
 
 
-def check_landmarks(found: tuple[Found, ...], labels: LabelMap, where: str) -> None:
+def check_landmarks(found: tuple[FoundSource, ...], labels: LabelMap, where: str) -> None:
     """Raise `VolumeError` unless the file has voxels of every landmark."""
     for tissue in LANDMARKS:
         if not any(each.n_voxels for each in found if each.label == TISSUE_LABELS[tissue]):

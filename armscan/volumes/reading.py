@@ -13,7 +13,7 @@ from armscan.errors import InvalidValueError, VolumeError, listed
 from armscan.utils.arrays import FloatArray
 from armscan.utils.validation import check_choice, check_path
 from armscan.volumes.header_checks import CHECKS
-from armscan.volumes.labelmap import Found, LabelMap, check_landmarks, map_values
+from armscan.volumes.labelmap import FoundSource, LabelMap, check_landmarks, map_values
 from armscan.volumes.orientation import AXES, Crop, check_axes, check_crop, check_orientation, orientation_of
 from armscan.volumes.plane import ManipulatorAction
 from armscan.volumes.segmentation import OVERLAPS, SEGMENTATION_SUFFIX, read_segmentation
@@ -121,7 +121,7 @@ def read_stored(
     return volume, stored
 
 
-def _read_labels(path: Path, options: ReadingOptions) -> tuple[SimpleITK.Image, tuple[Found, ...]]:
+def _read_labels(path: Path, options: ReadingOptions) -> tuple[SimpleITK.Image, tuple[FoundSource, ...]]:
     """Return the file as a SimpleITK image of the labels 0 to 4, and the values found in it."""
     # Deferred: slow to import, and phantoms do not need it.
     import SimpleITK

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from armscan.errors import VolumeError, listed
 from armscan.utils.arrays import FloatArray
-from armscan.volumes.labelmap import BACKGROUND, TISSUE_LABELS, Found, LabelMap, count_values, replaced, shown
+from armscan.volumes.labelmap import BACKGROUND, TISSUE_LABELS, FoundSource, LabelMap, apply_table, count_values, shown
 
 SEGMENTATION_SUFFIX = ".seg.nrrd"
 OVERLAPS = ("refuse", "first", "last")
@@ -29,7 +29,7 @@ class Segment:
 
 def read_segmentation(
     path: Path, labels: LabelMap | None, overlap: str
-) -> tuple[NDArray[np.uint8], FloatArray, tuple[Found, ...]]:
+) -> tuple[NDArray[np.uint8], FloatArray, tuple[FoundSource, ...]]:
     """Read a segmentation and map its segments to the labels 0 to 4 by their names.
 
     Segments of one tissue may overlap, and so may a background segment and any other. Where segments of different
@@ -61,12 +61,12 @@ def read_segmentation(
     counts = [count_values(layer) for layer in layers]
     segments = _segments(contents["segments"], len(layers), labels, path)
     _check_strays(segments, counts, labels, path)
-    found = tuple(Found(each.name, each.label, counts[each.layer].get(each.value, 0)) for each in segments)
+    found = tuple(FoundSource(each.name, each.label, counts[each.layer].get(each.value, 0)) for each in segments)
     if len(layers) == 1:
         # A value that does not occur may be none that the voxels can have.
         table = dict.fromkeys(counts[0], BACKGROUND)
         table |= {each.value: each.label for each in segments if each.value in table}
-        return replaced(layers[0], table), contents["ijkToLPS"], found
+        return apply_table(layers[0], table), contents["ijkToLPS"], found
     return _merged(layers, segments, overlap, path), contents["ijkToLPS"], found
 
 

@@ -96,8 +96,8 @@ def clearance(
     across_mm, depth_mm = (np.arange(n) * step for n, step in zip(shape, (spacing_mm[0], spacing_mm[2]), strict=True))
     nearest = 0.5
     for row, offset, step in zip(matrix, offset_mm, spacing_mm, strict=True):
-        places = (row[0] * across_mm[:, None] + row[2] * depth_mm + offset) / step + 0.5
-        nearest = min(nearest, float(np.abs(places - np.rint(places)).min()))
+        positions = (row[0] * across_mm[:, None] + row[2] * depth_mm + offset) / step + 0.5
+        nearest = min(nearest, float(np.abs(positions - np.rint(positions)).min()))
     # Halved as a margin for rounding; 0 if what is left is too close to rounding errors.
     free: float = nearest * min(spacing_mm) / (across_mm[-1] + depth_mm[-1] + 1.0) / 2.0
     return free if free > SMALLEST_CLEARANCE else 0.0
@@ -110,10 +110,10 @@ def _sample(
     spacing_mm: tuple[float, float, float],
     matrix: FloatArray,
     offset_mm: FloatArray,
-    places: NDArray[Any],
+    indices: NDArray[Any],
     slice_xz: NDArray[np.uint8],
 ) -> None:
-    """Do the work of `sample_plane`; `places` is a buffer for the flat voxel indices of the rows in progress."""
+    """Do the work of `sample_plane`; `indices` is a buffer for the flat voxel indices of the rows in progress."""
     s_x, s_y, s_z = spacing_mm
     axes = (
         _axis(0, matrix, offset_mm, s_x, s_z),
@@ -145,13 +145,13 @@ def _sample(
                     start, stop = _within(lines[1], 0, shape[1], start, stop)
                     start, stop = _within(lines[2], 0, shape[2], start, stop)
                 inside[slot, 0], inside[slot, 1] = start, stop
-                row = places[slot, start:stop]
-                _find_places(lines, shape, along[start:stop], row)
+                row = indices[slot, start:stop]
+                _find_indices(lines, shape, along[start:stop], row)
                 for pixel in range(0, row.size, PREFETCH_STEP):
                     prefetch(voxels, np.uint64(row[pixel]))
         for i in range(max(0, first - N_ROWS), min(first, n_across)):
             start, stop = inside[i % (2 * N_ROWS)]
-            _read(voxels, places[i % (2 * N_ROWS), start:stop], slice_xz[i, start:stop])
+            _read(voxels, indices[i % (2 * N_ROWS), start:stop], slice_xz[i, start:stop])
 
 
 @cached_njit(nogil=True, error_model="numpy")
@@ -213,22 +213,22 @@ def _are_inside(ends: tuple[Lines, Lines], shape: tuple[int, int, int], start: i
 
 
 @cached_njit(nogil=True, error_model="numpy")
-def _find_places(lines: Lines, shape: tuple[int, int, int], along: FloatArray, places: NDArray[Any]) -> None:
+def _find_indices(lines: Lines, shape: tuple[int, int, int], along: FloatArray, indices: NDArray[Any]) -> None:
     """Fill the flat voxel indices of a row's pixels, whose numbers are `along`."""
     (first_x, step_x), (first_y, step_y), (first_z, step_z) = lines
     n_x, n_z = float(shape[0]), float(shape[2])
     # In floats, which hold these whole numbers exactly, so that SIMD computes several at a time.
-    for k in range(places.size):
+    for k in range(indices.size):
         x, y = np.floor(first_x + step_x * along[k]), np.floor(first_y + step_y * along[k])
-        places[k] = (y * n_x + x) * n_z + np.floor(first_z + step_z * along[k])
+        indices[k] = (y * n_x + x) * n_z + np.floor(first_z + step_z * along[k])
 
 
 @cached_njit(nogil=True, error_model="numpy")
-def _read(voxels: NDArray[np.uint8], places: NDArray[Any], row: NDArray[np.uint8]) -> None:
+def _read(voxels: NDArray[np.uint8], indices: NDArray[Any], row: NDArray[np.uint8]) -> None:
     """Fill part of a slice's row."""
-    for k in range(places.size):
+    for k in range(indices.size):
         # An unsigned index needs no check for negative values.
-        row[k] = voxels[np.uint64(places[k])]
+        row[k] = voxels[np.uint64(indices[k])]
 
 
 @cached_njit(nogil=True, error_model="numpy")

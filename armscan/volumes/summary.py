@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 
-from armscan.volumes.labelmap import BACKGROUND, LABEL_NAMES, Found, LabelMap, Source, count_values
+from armscan.volumes.labelmap import BACKGROUND, LABEL_NAMES, FoundSource, LabelMap, Source, count_values
 from armscan.volumes.orientation import Crop, orientation_of
 from armscan.volumes.volume import LabelVolume
 
@@ -27,7 +27,7 @@ class StoredFile:
     shape: tuple[int, ...]
     spacing: tuple[float, ...]
     orientation: str
-    found: tuple[Found, ...]
+    found: tuple[FoundSource, ...]
     missing: tuple[Source, ...]
     crop_mm: Crop | None
 
@@ -61,7 +61,7 @@ class VolumeReport:
         return {tissue: count * math.prod(self.volume.spacing) for tissue, count in self.n_voxels.items()}
 
 
-def missing_sources(labels: LabelMap | None, found: tuple[Found, ...]) -> tuple[Source, ...]:
+def missing_sources(labels: LabelMap | None, found: tuple[FoundSource, ...]) -> tuple[Source, ...]:
     """Return the entries of the label map that the file lacks: values for a plain file, names for a segmentation."""
     if labels is None:
         return ()

@@ -126,7 +126,7 @@ def main() -> None:
     """Print the table."""
     volumes = read_dataset(sys.argv[1] if len(sys.argv) > 1 else DEFAULT_FOLDER)
     first = next(iter(volumes.values()))
-    one, to_plain = "one environment, one core", "SimpleITK and scikit-learn"
+    one, plain = "one environment, one core", "SimpleITK and scikit-learn"
     measures = {
         one: one_environment(volumes),
         f"{NUM_ENVS} environments side by side, {os.cpu_count()} cores": many_environments(volumes),
@@ -139,7 +139,7 @@ def main() -> None:
         ),
         "one, on a single volume": one_environment([first]),
         f"one, on that volume {TIMES_AS_LARGE} times as large": one_environment([larger(first)]),
-        to_plain: plain_pipeline(first),
+        plain: plain_pipeline(first),
     }
     for measure in measures.values():
         measure()

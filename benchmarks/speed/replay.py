@@ -107,11 +107,11 @@ def sampling_s(replay: Replay, seed: int) -> tuple[float, list[Batch]]:
     return time.perf_counter() - start_s, [batch.obs, batch.obs_next, obs_next]
 
 
-def compared(image: Replay, to_plain: Replay, same: bool) -> tuple[float, float, float]:
+def compared(image: Replay, plain: Replay, same: bool) -> tuple[float, float, float]:
     """Return the median milliseconds of a sampling of each, and their median ratio; if `same`, check the samples."""
     rounds = []
     for seed in range(N_ROUNDS):
-        (image_s, given), (plain_s, wanted) = sampling_s(image, seed), sampling_s(to_plain, seed)
+        (image_s, given), (plain_s, wanted) = sampling_s(image, seed), sampling_s(plain, seed)
         if same:
             for one, other in zip(given, wanted, strict=True):
                 for name in one.get_keys():
@@ -125,18 +125,18 @@ def measure(folder: str | Path, name: str, near: tuple) -> None:
     steps = batches(folder, near)
     n_ended = sum(int((step.terminated | step.truncated).sum()) for step in steps)
     space = EnvFactory(observation=SliceChannelsObservation(shape=(84, 84)), **RULES).make_env(read_dataset(folder))
-    to_plain = Replay(N_PLAIN, N_ENVS)
+    plain = Replay(N_PLAIN, N_ENVS)
     image = replay_for(space.observation_space, N_TRANSITIONS, N_ENVS)
     # Compiles: that memory is not the buffer's.
     replay_for(space.observation_space, N_ENVS, N_ENVS).add(steps[0])
     endless, n_steps = cycle(steps), N_PLAIN // N_ENVS
-    plain_s, plain_bytes = filled(to_plain, islice(cycle(steps), n_steps))
+    plain_s, plain_bytes = filled(plain, islice(cycle(steps), n_steps))
     before = resident_bytes()
     first_s, _ = filled(image, islice(endless, n_steps))
-    few = compared(image, to_plain, same=True)
+    few = compared(image, plain, same=True)
     rest_s, _ = filled(image, islice(endless, N_TRANSITIONS // N_ENVS - n_steps))
     grown, seconds = resident_bytes() - before, first_s + rest_s
-    many = compared(image, to_plain, same=False)
+    many = compared(image, plain, same=False)
     n_frames = sum(len(images.frames) for images in image._images.values())
     print(f"\n{name}: {N_PLAYED / n_ended:.1f} steps an episode; {n_frames:,} frames of {len(image):,} transitions,")
     print(f"{frame_bytes(image) / n_frames:.0f} bytes each\n")
@@ -144,7 +144,7 @@ def measure(folder: str | Path, name: str, near: tuple) -> None:
     of_a_million = 1_000_000 / 2**30
     for what, ours, theirs in (
         ("GiB of 1,000,000 transitions, growth of the process", grown / len(image), plain_bytes / N_PLAIN),
-        ("GiB of arrays and frames, counted", counted_bytes(image) / len(image), counted_bytes(to_plain) / N_PLAIN),
+        ("GiB of arrays and frames, counted", counted_bytes(image) / len(image), counted_bytes(plain) / N_PLAIN),
     ):
         print(f"| {what} | {ours * of_a_million:.2f} | {theirs * of_a_million:.2f} | 1/{theirs / ours:.0f} |")
     ours, theirs = seconds / len(image) * 1e6, plain_s / N_PLAIN * 1e6

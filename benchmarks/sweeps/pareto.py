@@ -28,7 +28,7 @@ from optuna.trial import FrozenTrial, TrialState, create_trial
 
 from armscan.sweeps.scheduling.state import env_steps_of, loss_signs
 from armscan.sweeps.storage.attribute_names import ENV_STEPS
-from armscan.sweeps.storage.reports import REPORT, keep_report, reports_of
+from armscan.sweeps.storage.reports import REPORT, reports_of, store_report
 from armscan.sweeps.study.pruners import ParetoPruner
 from benchmarks.sweeps.bench.table import VALIDATION, read_rows, table_file
 from benchmarks.sweeps.studies import run_study
@@ -105,7 +105,7 @@ def _replayed(study: optuna.Study, trial: FrozenTrial) -> int | None:
     """Run one trial of a replay; returns the environment steps after which it was pruned, None if it was not."""
     again = study.ask()
     for step, values in reports_of(trial).items():
-        keep_report(again.storage, again._trial_id, step, values)
+        store_report(again.storage, again._trial_id, step, values)
         if study.pruner.prune(study, again.storage.get_trial(again._trial_id)):
             study.tell(again, state=TrialState.PRUNED)
             return step

@@ -145,7 +145,7 @@ def round_trips_counted() -> Iterator[dict[int, int]]:
 def work(phase: Phase, name: str) -> None:
     """Run a worker as its process does."""
     heartbeat = Heartbeat(
-        phase.scheduler, name, is_told_to_leave=lambda: False, leave=lambda: None, on_death=lambda _: None
+        phase.scheduler, name, should_leave=lambda: False, leave=lambda: None, on_death=lambda _: None
     )
     with heartbeat.running():
         Worker(phase, [], heartbeat).work()

@@ -157,9 +157,7 @@ def _work(
     phase: Phase, words: Sequence[str], meter: Meter, is_used: Callable[[], bool], plan: Plan | None = None
 ) -> None:
     scheduler = BudgetedScheduler(phase, is_used, plan)
-    heartbeat = Heartbeat(
-        scheduler, NAME, is_told_to_leave=lambda: False, leave=lambda: None, on_death=phase.close_runs_of
-    )
+    heartbeat = Heartbeat(scheduler, NAME, should_leave=lambda: False, leave=lambda: None, on_death=phase.close_runs_of)
     budgeted = dataclasses.replace(phase, scheduler=scheduler, run=meter.timed(phase.run))
     with heartbeat.running():
         Worker(budgeted, words, heartbeat).work()

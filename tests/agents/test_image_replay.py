@@ -65,18 +65,18 @@ def assert_same(one, other):
             np.testing.assert_array_equal(one[name], other[name], err_msg=name)
 
 
-def assert_gives_the_same(image, to_plain):
+def assert_gives_the_same(image, plain):
     """Check every way to read transitions."""
-    assert len(image) == len(to_plain)
-    everything = to_plain.sample_indices(0)
-    assert_same(to_plain[everything], image[everything])
-    assert_same(to_plain[int(everything[-1])], image[int(everything[-1])])
-    for replay in (image, to_plain):
-        replay.seed(len(to_plain))
-    (batch, indices), (other, other_indices) = to_plain.sample(9), image.sample(9)
+    assert len(image) == len(plain)
+    everything = plain.sample_indices(0)
+    assert_same(plain[everything], image[everything])
+    assert_same(plain[int(everything[-1])], image[int(everything[-1])])
+    for replay in (image, plain):
+        replay.seed(len(plain))
+    (batch, indices), (other, other_indices) = plain.sample(9), image.sample(9)
     np.testing.assert_array_equal(indices, other_indices)
     assert_same(batch, other)
-    assert_same(to_plain[indices].obs_next, image[indices].obs_next)
+    assert_same(plain[indices].obs_next, image[indices].obs_next)
 
 
 def assert_frames_are_those_referred_to(replay):
@@ -90,27 +90,27 @@ def assert_frames_are_those_referred_to(replay):
 
 @pytest.mark.parametrize("size", [N_ENVS, 4 * N_ENVS, 300])
 def test_replay_gives_what_a_plain_one_gives(envs, size):
-    to_plain, image = Replay(size, N_ENVS), replay_for(envs.single_observation_space, size, N_ENVS)
+    plain, image = Replay(size, N_ENVS), replay_for(envs.single_observation_space, size, N_ENVS)
     assert isinstance(image, ImageReplay)
     for i, batch in enumerate(played(envs, 22)):
-        for a, b in zip(to_plain.add(batch), image.add(batch), strict=True):
+        for a, b in zip(plain.add(batch), image.add(batch), strict=True):
             np.testing.assert_array_equal(a, b)
         assert_frames_are_those_referred_to(image)
         if i in (0, 3, 12, 21):
-            assert_gives_the_same(image, to_plain)
+            assert_gives_the_same(image, plain)
         if i == 9:
-            for replay in (to_plain, image):
+            for replay in (plain, image):
                 replay.cut_off()
 
 
 def test_replay_takes_some_of_the_environments(envs):
-    to_plain, image = Replay(12, N_ENVS), replay_for(envs.single_observation_space, 12, N_ENVS)
+    plain, image = Replay(12, N_ENVS), replay_for(envs.single_observation_space, 12, N_ENVS)
     for i, batch in enumerate(played(envs, 15)):
         chosen = np.flatnonzero([True, i % 2 == 0, i % 3 != 0])
-        for replay in (to_plain, image):
+        for replay in (plain, image):
             replay.add(batch[chosen], buffer_ids=chosen)
         assert_frames_are_those_referred_to(image)
-    assert_gives_the_same(image, to_plain)
+    assert_gives_the_same(image, plain)
 
 
 def test_no_frame_is_kept_twice_within_an_episode(phantom):
@@ -145,24 +145,24 @@ NOISE = {"noise": spaces.Box(0, 255, (2, 5, 7), np.uint8)}
 
 def test_noise_and_unrelated_frames_are_kept_as_they_are():
     rng = np.random.default_rng(0)
-    to_plain, image = Replay(8, 2), ImageReplay(8, 2, NOISE)
+    plain, image = Replay(8, 2), ImageReplay(8, 2, NOISE)
     for _ in range(20):
         batch = noise(rng)
-        for replay in (to_plain, image):
+        for replay in (plain, image):
             replay.add(batch)
-        assert_gives_the_same(image, to_plain)
+        assert_gives_the_same(image, plain)
 
 
 @pytest.mark.parametrize("n_between", range(1, 7))
 def test_what_was_asked_for_before_is_not_given_for_what_came_later(n_between):
     rng = np.random.default_rng(0)
-    to_plain, image = Replay(2, 2), ImageReplay(2, 2, NOISE)
+    plain, image = Replay(2, 2), ImageReplay(2, 2, NOISE)
     for _ in range(8):
         # IDs are reused for other frames.
         for batch in [noise(rng) for _ in range(n_between)]:
-            for replay in (to_plain, image):
+            for replay in (plain, image):
                 replay.add(batch)
-        assert_same(to_plain[np.arange(2)], image[np.arange(2)])
+        assert_same(plain[np.arange(2)], image[np.arange(2)])
 
 
 def test_update_decodes_each_image_once(envs, monkeypatch):
@@ -178,13 +178,13 @@ def test_update_decodes_each_image_once(envs, monkeypatch):
 
 
 def test_reset_forgets_every_frame(envs):
-    to_plain, image = Replay(15, N_ENVS), replay_for(envs.single_observation_space, 15, N_ENVS)
+    plain, image = Replay(15, N_ENVS), replay_for(envs.single_observation_space, 15, N_ENVS)
     for seed in (0, 1):
         for batch in played(envs, 8, seed):
-            for replay in (to_plain, image):
+            for replay in (plain, image):
                 replay.add(batch)
-        assert_gives_the_same(image, to_plain)
-        for replay in (to_plain, image):
+        assert_gives_the_same(image, plain)
+        for replay in (plain, image):
             replay.reset()
         assert len(image) == 0
         assert all(len(images.frames) == 0 for images in image._images.values())
@@ -192,7 +192,7 @@ def test_reset_forgets_every_frame(envs):
 
 @pytest.mark.parametrize("n_steps", [0, 3, 17])
 def test_replay_goes_on_from_a_checkpoint_bit_for_bit(envs, tmp_path, n_steps):
-    to_plain, image, other = (
+    plain, image, other = (
         Replay(18, N_ENVS),
         *(replay_for(envs.single_observation_space, 18, N_ENVS) for _ in range(2)),
     )
@@ -200,19 +200,19 @@ def test_replay_goes_on_from_a_checkpoint_bit_for_bit(envs, tmp_path, n_steps):
     for batch in played(envs, 4, seed=5):
         other.add(batch)
     for batch in played(envs, n_steps):
-        for replay in (to_plain, image):
+        for replay in (plain, image):
             replay.add(batch)
-    for replay in (to_plain, image):
+    for replay in (plain, image):
         replay.cut_off()
     save_checkpoint(tmp_path / "last.pt", image.state(), {})
     other.load_state(load_checkpoint(tmp_path / "last.pt")[0])
     if n_steps:
-        assert_gives_the_same(other, to_plain)
+        assert_gives_the_same(other, plain)
     for batch in played(envs, 11, seed=1):
-        for replay in (to_plain, image, other):
+        for replay in (plain, image, other):
             replay.add(batch)
         assert_frames_are_those_referred_to(other)
-    assert_gives_the_same(other, to_plain)
+    assert_gives_the_same(other, plain)
     states = [tensors(replay.state()) for replay in (image, other)]
     assert states[0].keys() == states[1].keys()
     assert all(torch.equal(tensor, states[1][name]) for name, tensor in states[0].items())

@@ -6,7 +6,7 @@ import platform
 import numpy as np
 import torch
 
-from armscan.tracking.environment import TOLD, environment, environment_file, environment_tags
+from armscan.tracking.environment import REPORTED_PACKAGES, environment, environment_file, environment_tags
 
 
 def test_environment_has_the_versions_that_are_loaded():
@@ -19,7 +19,7 @@ def test_environment_has_the_versions_that_are_loaded():
 
 def test_environment_tags_tell_what_figures_may_depend_on():
     tags = environment_tags()
-    assert set(tags) == {"version.python", "constraints.sha256", *(f"version.{name}" for name in TOLD)}
+    assert set(tags) == {"version.python", "constraints.sha256", *(f"version.{name}" for name in REPORTED_PACKAGES)}
     assert "not installed" not in tags.values()
 
 

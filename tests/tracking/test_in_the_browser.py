@@ -7,7 +7,7 @@ from mlflow.entities import Metric, Param
 
 from armscan.launch.best_job import BEST_TAG, show_best
 from armscan.tracking import TrackedRun, open_store
-from armscan.tracking.uploader import leave_note
+from armscan.tracking.uploader import set_description
 from armscan.tracking.view import VIEW, VIEW_TAG
 
 RATE, STEPS = "test_volumes/on_plane_5mm_10deg", "test_volumes/mean_steps"
@@ -135,10 +135,10 @@ def test_description_of_a_grid_follows_its_table_unless_somebody_wrote_one(store
     client, experiment_id = store()
     run_id = client.create_run(experiment_id, name="multirun", tags={}).info.run_id
     for table in ("early", "late"):
-        leave_note(client, run_id, table)
+        set_description(client, run_id, table)
         assert client.get_run(run_id).data.tags["mlflow.note.content"] == table
     client.set_tag(run_id, "mlflow.note.content", "mine")
-    leave_note(client, run_id, "latest")
+    set_description(client, run_id, "latest")
     assert client.get_run(run_id).data.tags["mlflow.note.content"] == "mine"
 
 
@@ -146,6 +146,6 @@ def test_description_follows_a_result_that_changes(store, tmp_path):
     client, experiment_id = store()
     with TrackedRun.start(client, experiment_id, name="a", config={}, tags={}, folder=tmp_path) as first:
         first.set_note("early")
-    with TrackedRun.joined(client, first.run_id, name="a", folder=tmp_path) as again:
+    with TrackedRun.open_existing(client, first.run_id, name="a", folder=tmp_path) as again:
         again.set_note("late")
     assert client.get_run(first.run_id).data.tags["mlflow.note.content"] == "late"

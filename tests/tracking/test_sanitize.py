@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mlflow.utils.validation import MAX_PARAM_VAL_LENGTH, MAX_TAG_VAL_LENGTH, _validate_param, _validate_tag
 
-from armscan.tracking.sanitize import MAX_PARAM_CHARS, MAX_TAG_CHARS, name_of, params_of, shortened, tags_of
+from armscan.tracking.sanitize import MAX_PARAM_CHARS, MAX_TAG_CHARS, name_of, params_of, tags_of, truncate
 
 KEYS = st.text(min_size=1, max_size=300) | st.from_regex(r"[a-z_]{1,9}(\.[a-z_]{1,9}){0,40}", fullmatch=True)
 
@@ -50,8 +50,8 @@ def test_values_that_differ_after_the_cut_do_not_become_the_same():
 
 @given(st.text(max_size=200), st.integers(min_value=90, max_value=300))
 def test_shortened_text_is_as_long_as_it_may_be_at_most(text, at_most):
-    assert len(shortened(text, at_most, "file")) <= at_most
-    assert shortened(text, at_most, "file") == text or len(text) > at_most
+    assert len(truncate(text, at_most, "file")) <= at_most
+    assert truncate(text, at_most, "file") == text or len(text) > at_most
 
 
 def test_params_too_long_for_a_store_reach_it(tmp_path, database):

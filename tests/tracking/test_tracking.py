@@ -24,7 +24,7 @@ from armscan.tracking import (
 )
 from armscan.tracking.notes import notes
 from armscan.tracking.outbox import Address, Outbox, file_of
-from armscan.tracking.sanitize import flattened
+from armscan.tracking.sanitize import flatten
 from armscan.tracking.sync import _upload_pending, sync
 from armscan.tracking.tags import VERSION_TAG
 from armscan.tracking.uploader import upload
@@ -338,7 +338,7 @@ def test_open_store_names_a_damaged_store(tmp_path):
 
 
 def test_flattened_gives_dotted_keys_and_keeps_lists():
-    assert flattened({"a": {"b": 1, "c": {"d": None}}, "e": [1, 2], "f": {}}) == {
+    assert flatten({"a": {"b": 1, "c": {"d": None}}, "e": [1, 2], "f": {}}) == {
         "a.b": 1,
         "a.c.d": None,
         "e": "[1, 2]",

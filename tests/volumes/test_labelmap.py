@@ -5,7 +5,7 @@ import pytest
 
 from armscan.errors import InvalidValueError, VolumeError
 from armscan.volumes import LabelMap, LabelVolume, open_dataset, read_volume
-from armscan.volumes.labelmap import Found, map_values
+from armscan.volumes.labelmap import FoundSource, map_values
 
 MAP = LabelMap(bones=[10, 11], tendons=[20], artery=[30])
 TINY_VALUES = {1: 10, 2: 20, 3: 30}
@@ -54,7 +54,7 @@ def test_map_values_takes_any_whole_number(tiny_volume, values, dtype):
 
 def test_map_values_tells_what_it_found():
     _, found = map_values(np.array([[[0, 7, 30]]]), LabelMap([7], [8], [9], background=[30]), "wrist")
-    assert found == (Found(0, 0, 1), Found(7, 1, 1), Found(30, 0, 1))
+    assert found == (FoundSource(0, 0, 1), FoundSource(7, 1, 1), FoundSource(30, 0, 1))
 
 
 def test_label_map_takes_0_for_background_unless_a_tissue_names_it():

@@ -11,7 +11,7 @@ from optuna.trial import FrozenTrial
 REPORT = "report:"
 
 
-def keep_report(storage: BaseStorage, trial_id: int, step: int, values: Sequence[float]) -> None:
+def store_report(storage: BaseStorage, trial_id: int, step: int, values: Sequence[float]) -> None:
     """Store a report.
 
     A single value is stored as Optuna's intermediate value. Optuna supports no reports of several objectives, and its

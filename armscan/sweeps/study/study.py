@@ -22,7 +22,7 @@ from armscan.sweeps.storage.attributes import StudyAttributes, check_trials
 from armscan.sweeps.storage.storage import Storage
 from armscan.sweeps.study.components import make
 from armscan.sweeps.study.settings import StudySettings
-from armscan.tracking import flattened
+from armscan.tracking import flatten
 
 N_SHOWN = 5
 
@@ -94,7 +94,7 @@ def comparable_settings(settings: StudySettings, fixed: Mapping[str, Any]) -> di
     if settings.constraints:
         of_trials["study.constraints"] = list(map(str, settings.constraints))
     left_out = tuple(f"{each}." for each in (*NOT_COMPARED, *(one.name for one in settings.space.parameters)))
-    shared = {key: value for key, value in flattened(fixed).items() if not f"{key}.".startswith(left_out)}
+    shared = {key: value for key, value in flatten(fixed).items() if not f"{key}.".startswith(left_out)}
     shared = {key: value for key, value in shared.items() if key not in ADDED or value is not None}
     return {
         SPACE: settings.space.to_plain(),

@@ -20,7 +20,7 @@ from optuna.trial import Trial
 from armscan.errors import InvalidValueError, listed
 from armscan.sweeps.scheduling.state import PendingWrites
 from armscan.sweeps.storage.attribute_names import ENV_STEPS, EPISODES, INTERVAL, PARENT, RETRY_OF, RUN, SEEDS
-from armscan.sweeps.storage.reports import keep_report, reports_of
+from armscan.sweeps.storage.reports import reports_of, store_report
 from armscan.tracking import TrackedRun
 from armscan.training import Evaluation, Split
 from armscan.utils.validation import check_float
@@ -171,7 +171,7 @@ class Attempt:
         study, storage, trial_id = self.trial.study, self.trial.storage, self.trial._trial_id
         # Not by the trial's own methods: they never repeat a report, although the storage may have lost it with the
         # connection, and they refuse several objectives.
-        keep_report(storage, trial_id, step, values)
+        store_report(storage, trial_id, step, values)
         return study.pruner.prune(study, storage.get_trial(trial_id))
 
 

@@ -70,11 +70,11 @@ class Heartbeat:
     Args:
         scheduler: Scheduler of the study.
         worker: Name of this worker.
-        is_told_to_leave: Function that is polled several times a second.
+        should_leave: Function that is polled several times a second.
         leave: Function that ends the process, once the current trial is requeued; mostly called from another thread
             than the worker's.
         on_death: Function that is called with each reclaimed trial.
-        is_told_to_leave_soon: Function that is polled when a trial is claimed and when it reports progress, where
+        should_leave_soon: Function that is polled when a trial is claimed and when it reports progress, where
             leaving loses nothing.
     """
 
@@ -83,15 +83,15 @@ class Heartbeat:
         scheduler: TrialScheduler,
         worker: str,
         *,
-        is_told_to_leave: Callable[[], bool],
+        should_leave: Callable[[], bool],
         leave: Callable[[], None],
         on_death: Callable[[FrozenTrial], None],
-        is_told_to_leave_soon: Callable[[], bool] = lambda: False,
+        should_leave_soon: Callable[[], bool] = lambda: False,
     ) -> None:
         self._lease: dict[str, Any] = {"worker": worker, **asdict(ProcessInfo.current()), "beat": 0}
         self._scheduler, self._liveness = scheduler, LivenessCheck()
-        self._is_told_to_leave, self._leave, self._on_death = is_told_to_leave, leave, on_death
-        self._is_told_to_leave_soon = is_told_to_leave_soon
+        self._should_leave, self._leave, self._on_death = should_leave, leave, on_death
+        self._should_leave_soon = should_leave_soon
         self._trial: Trial | None = None
         # Closes the open runs of the current trial if the process is told to leave.
         self.cleanup: Callable[[], None] | None = None
@@ -162,7 +162,7 @@ class Heartbeat:
             self._trial = None
 
     def _leave_if_told_to(self) -> None:
-        if self._is_told_to_leave_soon():
+        if self._should_leave_soon():
             self.requeue()
             self._leave()
 
@@ -171,7 +171,7 @@ class Heartbeat:
             is_told = False
             # A shared folder may be unavailable for a moment.
             with suppress(OSError):
-                is_told = self._is_told_to_leave()
+                is_told = self._should_leave()
             if is_told:
                 late = threading.Timer(REQUEUE_TIMEOUT_S, self._leave)
                 late.daemon = True

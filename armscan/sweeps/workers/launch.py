@@ -60,7 +60,9 @@ def run_workers(opened: OpenedStudy, given: StudyCommand, launcher: str, launch:
     folder.mkdir(parents=True)
     ProcessInfo.current(str(working_folder())).write(folder / LAUNCHER_FILE)
     arguments = _arguments(opened, given, launcher, folder)
-    tracked = TrackedRun.joined(opened.search.client, opened.search.run_id, name=opened.settings.name, folder=folder)
+    tracked = TrackedRun.open_existing(
+        opened.search.client, opened.search.run_id, name=opened.settings.name, folder=folder
+    )
     tracked.resume()
     leave_s = LEAVE_S if launcher in ON_THIS_MACHINE else LEAVE_ELSEWHERE_S
     monitor = StudyMonitor(opened)

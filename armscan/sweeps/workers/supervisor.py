@@ -121,7 +121,7 @@ def worker_main(supervisor_pid: int) -> None:
     # The launcher may have blocked it.
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
-    def is_told_to_leave() -> bool:
+    def should_leave() -> bool:
         return request.is_now or not launcher.is_alive or (folder / STOP_FILE).exists()
 
     from armscan.sweeps.workers.heartbeat import Heartbeat
@@ -131,8 +131,8 @@ def worker_main(supervisor_pid: int) -> None:
     make_heartbeat = partial(
         Heartbeat,
         worker=f"{folder.name}/{number}",
-        is_told_to_leave=is_told_to_leave,
-        is_told_to_leave_soon=lambda: request.is_soon,
+        should_leave=should_leave,
+        should_leave_soon=lambda: request.is_soon,
         leave=partial(os._exit, LEFT),
     )
     try:

@@ -312,7 +312,7 @@ def test_keepers_of_many_trials_take_turns_in_looking_after_them(make_scheduler,
     scheduler, now_s, looks = make_scheduler(), [100.0], []
     monkeypatch.setattr(lease_module.time, "monotonic", lambda: now_s[0])
     monkeypatch.setattr(lease_module, "MAX_CHECKERS", 2)
-    heartbeat = Heartbeat(scheduler, "a", is_told_to_leave=lambda: False, leave=lambda: None, on_death=pytest.fail)
+    heartbeat = Heartbeat(scheduler, "a", should_leave=lambda: False, leave=lambda: None, on_death=pytest.fail)
     heartbeat.claim()
     alive = asdict(ProcessInfo.current())
     for _ in range(4):
@@ -364,7 +364,7 @@ def test_request_to_stop_a_trial_is_not_forgotten_between_two_checks(make_schedu
     scheduler, now_s = make_scheduler(), [100.0]
     monkeypatch.setattr(lease_module.time, "monotonic", lambda: now_s[0])
     monkeypatch.setattr(lease_module, "MAX_CHECKERS", 1)
-    heartbeat = Heartbeat(scheduler, "a", is_told_to_leave=lambda: False, leave=lambda: None, on_death=pytest.fail)
+    heartbeat = Heartbeat(scheduler, "a", should_leave=lambda: False, leave=lambda: None, on_death=pytest.fail)
     trial = heartbeat.claim()
     for _ in range(2):
         scheduler.claim(asdict(ProcessInfo.current()) | {"worker": "b"})

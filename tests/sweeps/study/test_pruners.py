@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from optuna.trial import TrialState
 
 from armscan.errors import InvalidValueError, StudyError
-from armscan.sweeps.storage.reports import keep_report, reports_of
+from armscan.sweeps.storage.reports import reports_of, store_report
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.components import read_settings
 from armscan.sweeps.study.pruners import ParetoPruner, crowding_distances, front_numbers, n_better
@@ -73,7 +73,7 @@ def report(storage_uri):
     def run(values_at, ended=None):
         trial = study.ask()
         for step, values in values_at.items():
-            keep_report(storage.optuna, trial._trial_id, step, values)
+            store_report(storage.optuna, trial._trial_id, step, values)
             if study.pruner.prune(study, storage.optuna.get_trial(trial._trial_id)):
                 study.tell(trial, state=TrialState.PRUNED)
                 return step

@@ -258,7 +258,7 @@ def test_worker_that_is_opened_while_the_server_is_away_waits_for_it(postgres):
 def test_worker_that_is_told_to_leave_while_the_storage_is_away_leaves_soon(open_scheduler, postgres, monkeypatch):
     monkeypatch.setattr(lease, "REQUEUE_TIMEOUT_S", 1.0)
     scheduler, told, left = open_scheduler(), threading.Event(), threading.Event()
-    heartbeat = Heartbeat(scheduler, "a", is_told_to_leave=told.is_set, leave=left.set, on_death=pytest.fail)
+    heartbeat = Heartbeat(scheduler, "a", should_leave=told.is_set, leave=left.set, on_death=pytest.fail)
     with heartbeat.running():
         heartbeat.claim()
         postgres.stop()

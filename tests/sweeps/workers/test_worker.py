@@ -97,7 +97,7 @@ def make_phase(tmp_path, empty_database):
 
 
 def make_heartbeat(scheduler, on_death=lambda _: None):
-    return Heartbeat(scheduler, "0", is_told_to_leave=lambda: False, leave=lambda: os._exit(1), on_death=on_death)
+    return Heartbeat(scheduler, "0", should_leave=lambda: False, leave=lambda: os._exit(1), on_death=on_death)
 
 
 @pytest.fixture
@@ -196,14 +196,14 @@ def test_worker_that_cannot_read_whether_it_is_told_to_leave_asks_again(monkeypa
     left = threading.Event()
     answers = iter([OSError(errno.ESTALE, "Stale file handle"), False, True])
 
-    def is_told_to_leave():
+    def should_leave():
         if isinstance(answer := next(answers, True), OSError):
             raise answer
         return answer
 
     monkeypatch.setattr(heartbeat, "POLL_S", 0.01)
     scheduler = make_phase("a").scheduler
-    beating = Heartbeat(scheduler, "0", is_told_to_leave=is_told_to_leave, leave=left.set, on_death=lambda _: None)
+    beating = Heartbeat(scheduler, "0", should_leave=should_leave, leave=left.set, on_death=lambda _: None)
     with beating.running():
         assert left.wait(HANG_S)
 
@@ -235,7 +235,7 @@ def test_worker_that_is_told_to_leave_while_it_opens_a_tracked_run_leaves_a_tria
         monkeypatch.setattr(heartbeat, timeout, HANG_S)
     monkeypatch.setattr(TrackedRun, "start", start_slowly)
     phase = make_phase("a", run, n_trials=1)
-    beating = Heartbeat(phase.scheduler, "0", is_told_to_leave=told.is_set, leave=leave, on_death=lambda _: None)
+    beating = Heartbeat(phase.scheduler, "0", should_leave=told.is_set, leave=leave, on_death=lambda _: None)
     with beating.running():
         Worker(phase, ["data.n_training=1"], beating).work()
     (trial,) = phase.scheduler.study.trials
