@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from armscan.evaluation.volumes import Volumes
 
 N_EPISODES, N_VIDEO_EPISODES = 200, 3
+ON_PLANE_KEY = "evaluation.on_plane"
 # Overrides of `armscan run` that are options here.
 OPTIONS = {
     "agent": "--agent NAME",
@@ -200,9 +201,9 @@ def _check_words(run: Sequence[str], agent: str | None, data: str | None, change
     given |= dict.fromkeys(("data", "data.path"), "--data") if data is not None else {}
     for word in run:
         key = word.partition("=")[0].lstrip("+~")
-        if key in OPTIONS or key.startswith(("tracking.", "evaluation.")):
-            option = OPTIONS.get(key, "options of armscan evaluate")
-            raise click.UsageError(f"{key} cannot be set here: give {option}")
+        if key != ON_PLANE_KEY and (key in OPTIONS or key.startswith(("tracking.", "evaluation."))):
+            instead = f"give {OPTIONS[key]}" if key in OPTIONS else "see armscan evaluate --help"
+            raise click.UsageError(f"{key} cannot be set here: {instead}")
         if key in given:
             raise click.UsageError(f"{given[key]} and {key} are both given, but they are one value: give one of them")
 

@@ -69,13 +69,13 @@ class Job:
         if hydra_config.mode != RunMode.MULTIRUN:
             return None
         folder = Path(hydra_config.sweep.dir)
-        word = json.loads((folder / PARENT_FILE).read_text())
+        parent = json.loads((folder / PARENT_FILE).read_text())
         overrides = list(hydra_config.overrides.task)
         # Hydra passes booleans on in Python's spelling, False for false.
-        common = {override.lower() for override in word["overrides"]}
+        common = {override.lower() for override in parent["overrides"]}
         varied = [override for override in overrides if override.lower() not in common]
         words = shlex.join(overrides), " ".join(varied)
-        return cls(hydra_config.job.num, *words, word["run_id"], folder, is_repeated=word["is_repeated"])
+        return cls(hydra_config.job.num, *words, parent["run_id"], folder, is_repeated=parent["is_repeated"])
 
     @property
     def label(self) -> str:

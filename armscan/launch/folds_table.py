@@ -69,11 +69,14 @@ def _evaluations(folder: Path) -> dict[str, Evaluation]:
     return {AGENT: agent, **{f"{name}{ALL_FOLDS}": Evaluation.of_dict(each) for name, each in baselines.items()}}
 
 
-def keep_table(table: ResultTable, folder: Path, store: TrackingStore, run_id: str, notes: Sequence[str]) -> None:
-    """Save the table of all folds in the grid's folder, and the table with its figures in the grid's run.
+def keep_table(
+    table: ResultTable, jobs: ResultTable, folder: Path, store: TrackingStore, run_id: str, notes: Sequence[str]
+) -> None:
+    """Save the tables of all folds and of the jobs in the grid's folder, and with the figures in the grid's run.
 
     Args:
-        table: Table to save.
+        table: Table of all folds.
+        jobs: Table of the jobs, shown below.
         folder: Folder of the grid.
         store: Store of the grid's run.
         run_id: MLflow run ID of the grid.
@@ -88,7 +91,8 @@ def keep_table(table: ResultTable, folder: Path, store: TrackingStore, run_id: s
     from armscan.tracking.uploader import set_description
 
     file = folder / RESULTS_PAGE
-    text = page("all folds (test)", "".join(f"<p>{html.escape(note)}</p>" for note in notes) + table.html())
+    said = "".join(f"<p>{html.escape(note)}</p>" for note in notes)
+    text = page("all folds (test)", f"{said}{table.html()}<h2>Jobs</h2>{jobs.html()}")
     atomic_write(file, methodcaller("write", text.encode()))
     time_ms = now_ms()
     groups = {title: TEST_GROUP if title == AGENT else title.removesuffix(ALL_FOLDS) for title in table.results}

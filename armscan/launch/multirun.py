@@ -81,10 +81,10 @@ class Multirun(Callback):
         hydra_words = [word for word in config.hydra.overrides.hydra if not word.startswith(NOT_REPEATED)]
         again = [*overrides, *hydra_words, f"{TRACKING_URI}='{tracking['uri']}'"]
         tags = {**source().tags, "overrides": command, "working_folder": str(Path.cwd()), GRID_TAG: json.dumps(again)}
-        parent = client.create_run(experiment_id, name=f"multirun {command}"[:250], tags=tags)
-        word = {"run_id": parent.info.run_id, "tracking": tracking, "overrides": overrides}
-        word |= {"is_repeated": Multirun.is_repeated, "trust": untrusted_word(again, tracking["uri"]) is not None}
-        (folder / PARENT_FILE).write_text(json.dumps(word))
+        run = client.create_run(experiment_id, name=f"multirun {command}"[:250], tags=tags)
+        parent = {"run_id": run.info.run_id, "tracking": tracking, "overrides": overrides}
+        parent |= {"is_repeated": Multirun.is_repeated, "trust": untrusted_word(again, tracking["uri"]) is not None}
+        (folder / PARENT_FILE).write_text(json.dumps(parent))
         Multirun.folder = folder
 
 
@@ -116,9 +116,9 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
         unended = {number for number, outcome in failed.items() if outcome.failure in (NO_OUTCOME, INTERRUPTED)}
         outcomes |= {number: replace(failed.pop(number), failure=INTERRUPTED) for number in unended}
     status = "KILLED" if is_interrupted else "FAILED" if failed or not outcomes else "FINISHED"
-    word = json.loads((folder / PARENT_FILE).read_text())
+    parent = json.loads((folder / PARENT_FILE).read_text())
     try:
-        store, runs = _close_parent(folder, word, status, failed)
+        store, runs = _close_parent(folder, parent, status, failed)
     except TrackingError as error:
         print(f"{error}; {armscan_command('runs', 'sync', str(folder))} uploads the rest", file=sys.stderr)
         store, runs = None, []
@@ -127,15 +127,15 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
 
         table = print_jobs(outcomes, {run.data.tags[JOB_TAG]: run.info.run_id for run in runs})
         if store is not None and runs:
-            _keep_tables(table, folder, word, outcomes, runs, store)
-            print_where_to_look(folder, word["tracking"]["uri"], files=(RESULTS_PAGE, ""))
-            compare = armscan_command("report", "--runs", word["run_id"], tracking=word["tracking"]["uri"])
+            _keep_tables(table, folder, parent, outcomes, runs, store)
+            print_where_to_look(folder, parent["tracking"]["uri"], files=(RESULTS_PAGE, ""))
+            compare = armscan_command("report", "--runs", parent["run_id"], tracking=parent["tracking"]["uri"])
             print(f"compare   {compare}")
     for number, outcome in failed.items():
         print(f"job {number} failed: {outcome.failure}", file=sys.stderr)
         print(f"  again alone: {run_command([])} {outcome.overrides}", file=sys.stderr)
     if status != "FINISHED":
-        _print_resume_commands(word, runs)
+        _print_resume_commands(parent, runs)
     if store is not None and not runs:
         remove_run_folder(folder)
     return 1 if failed or not outcomes else 0
@@ -147,22 +147,22 @@ def _read_outcomes(folder: Path) -> dict[str, JobOutcome]:
     return {file.stem: JobOutcome(**json.loads(file.read_text())) for file in files}
 
 
-def _print_resume_commands(word: Mapping[str, Any], runs: Sequence[Run]) -> None:
+def _print_resume_commands(parent: Mapping[str, Any], runs: Sequence[Run]) -> None:
     """Print the commands that resume the jobs that have not finished."""
-    uri = word["tracking"]["uri"]
+    uri = parent["tracking"]["uri"]
     for run in runs:
         if run.info.status != "FINISHED" and (Path(run.data.tags[FOLDER_TAG]) / LAST_CHECKPOINT).exists():
             again = resume_command(run.info.run_id, uri, trust=needs_trust(run.data.params))
             print(f"resume job {run.data.tags[JOB_TAG]} with: {again}", file=sys.stderr)
     if runs:
-        again = resume_command(word["run_id"], uri, trust=word["trust"])
+        again = resume_command(parent["run_id"], uri, trust=parent["trust"])
         print(f"resume all with: {again}", file=sys.stderr)
 
 
 def _keep_tables(
     table: ResultTable,
     folder: Path,
-    word: Mapping[str, Any],
+    parent: Mapping[str, Any],
     outcomes: Mapping[str, JobOutcome],
     runs: Sequence[Run],
     store: TrackingStore,
@@ -171,46 +171,49 @@ def _keep_tables(
     from mlflow.exceptions import MlflowException
 
     try:
-        _keep_page(table, folder, word, store)
-        _pool_folds(folder, word, outcomes, runs, store)
+        if not _pool_folds(table, folder, parent, outcomes, runs, store):
+            _keep_page(table, folder, parent, store)
     except (TrackingError, MlflowException, OSError) as error:
         print(f"the tables of the grid are not kept: {one_line_message(error) or error}", file=sys.stderr)
 
 
-def _keep_page(table: ResultTable, folder: Path, word: Mapping[str, Any], store: TrackingStore) -> None:
+def _keep_page(table: ResultTable, folder: Path, parent: Mapping[str, Any], store: TrackingStore) -> None:
     """Save the table of the jobs as a page, in the grid's folder and with its parent run."""
     from armscan.reports.html import page
     from armscan.tracking.uploader import set_description
 
     file, n_jobs = folder / RESULTS_PAGE, sum(map(bool, table.facts["outcome"]))
-    body = f"<p><code>{html.escape(' '.join(word['overrides']))}</code></p>{table.html()}"
+    body = f"<p><code>{html.escape(' '.join(parent['overrides']))}</code></p>{table.html()}"
     atomic_write(file, methodcaller("write", page(f"Grid of {n_jobs} job{'s' if n_jobs > 1 else ''}", body).encode()))
-    store.log_artifact(word["run_id"], str(file))
-    set_description(store, word["run_id"], table.markdown())
+    store.log_artifact(parent["run_id"], str(file))
+    set_description(store, parent["run_id"], table.markdown())
 
 
 def _pool_folds(
+    jobs: ResultTable,
     folder: Path,
-    word: Mapping[str, Any],
+    parent: Mapping[str, Any],
     outcomes: Mapping[str, JobOutcome],
     runs: Sequence[Run],
     store: TrackingStore,
-) -> None:
-    """Print one table over all folds of a cross-validation, and save it in place of the table of the jobs."""
+) -> bool:
+    """Print one table over all folds of a cross-validation, and save it above the table of the jobs; False without."""
     from armscan.experiment.console import print_table
     from armscan.launch.folds_table import folds_table, keep_table
 
     finished = [run for run in runs if outcomes[run.data.tags[JOB_TAG]].failure is None]
     table = folds_table((Path(run.data.tags[FOLDER_TAG]), outcomes[run.data.tags[JOB_TAG]].varied) for run in finished)
-    if table is not None:
-        left_out = len(outcomes) - len(finished)
-        notes = [f"{left_out} of {len(outcomes)} jobs are missing"] if left_out else []
-        print_table("all folds (test)", table, notes)
-        keep_table(table, folder, store, word["run_id"], notes)
+    if table is None:
+        return False
+    left_out = len(outcomes) - len(finished)
+    notes = [f"{left_out} of {len(outcomes)} jobs are missing"] if left_out else []
+    print_table("all folds (test)", table, notes)
+    keep_table(table, jobs, folder, store, parent["run_id"], notes)
+    return True
 
 
 def _close_parent(
-    folder: Path, word: Mapping[str, Any], status: str, failed: Mapping[str, JobOutcome]
+    folder: Path, parent: Mapping[str, Any], status: str, failed: Mapping[str, JobOutcome]
 ) -> tuple[TrackingStore, list[Run]]:
     """Close the parent run and the open runs of killed jobs; delete the parent if no job has started a run.
 
@@ -222,11 +225,11 @@ def _close_parent(
     from armscan.tracking.sync import PROCESS_DIED
 
     tags = {f"failure.{number}": f"{each.varied}: {each.failure}" for number, each in failed.items()}
-    note_end(folder, word["run_id"], word["tracking"]["uri"], status, tags)
-    store, experiment_id = open_store(**word["tracking"], retry_s=word["tracking"]["wait_s"])
+    note_end(folder, parent["run_id"], parent["tracking"]["uri"], status, tags)
+    store, experiment_id = open_store(**parent["tracking"], retry_s=parent["tracking"]["wait_s"])
     # Uploads what the jobs could not while the store was unavailable.
     sync(folder, lambda _: store)
-    below = store.children(experiment_id, word["run_id"])
+    below = store.children(experiment_id, parent["run_id"])
     # Users may have nested other runs below it.
     children = [run for run in below if run.data.tags.get(JOB_TAG, "").isdecimal() and FOLDER_TAG in run.data.tags]
     for child in children:
@@ -236,7 +239,7 @@ def _close_parent(
             store.set_tag(child.info.run_id, FAILURE_TAG, INTERRUPTED if is_killed else NO_OUTCOME)
             store.set_terminated(child.info.run_id, "KILLED" if is_killed else "FAILED")
     if not children:
-        store.delete_run(word["run_id"])
+        store.delete_run(parent["run_id"])
     else:
-        show_best(store, word["run_id"], children)
+        show_best(store, parent["run_id"], children)
     return store, sorted(children, key=lambda child: int(child.data.tags[JOB_TAG]))

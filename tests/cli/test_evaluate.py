@@ -61,10 +61,10 @@ def test_evaluate_answers_mistakes_in_one_line(answer, tmp_path, data_folder):
             ["--agent=random", "+tracking.uri=x"],
             "tracking.uri cannot be set here: give --tracking URI",
         ),
-        (["--agent=random", "tracking.artifacts=x"], "tracking.artifacts cannot be set here"),
+        (["--agent=random", "tracking.artifacts=x"], "tracking.artifacts cannot be set here: see armscan evaluate --help"),
         (
             ["--agent=random", "evaluation.episodes=5", "--episodes=2"],
-            "evaluation.episodes is for armscan run, and not",
+            "evaluation.episodes cannot be set here: give --episodes NUMBER",
         ),
         (
             ["--agent=random", "env.success_threshold=0.01", "--success-threshold=0.5"],

@@ -36,12 +36,14 @@ def test_baseline_takes_a_preset_as_a_run_does_and_an_experiment_of_mlflow(answe
         "--phantoms=1",
         "--episodes=1",
         "--tracking-experiment=x",
+        "evaluation.on_plane=[[3,5]]",
     ]
-    code, _, errors = answer(*words)
+    code, printed, errors = answer(*words)
     assert (code, errors) == (0, "")
     client = store_of(tmp_path)
     (run,) = client.search_runs([client.get_experiment_by_name("x").experiment_id])
     assert run.data.params["projection"] == "full"
+    assert "On plane, 3 mm 5°: agent" in printed
     assert run.data.params["agent._target_"] == "armscan.agents.Random"
 
 
