@@ -146,11 +146,13 @@ def test_page_and_description_of_all_folds_say_what_is_missing(tmp_path, databas
     store, experiment_id = open_store(database, experiment="a", artifacts=str(tmp_path / "artifacts"), wait_s=60.0)
     run_id = store.create_run(experiment_id, name="grid", tags={}).info.run_id
     table = folds_table([(left_by_a_run(tmp_path / "a", "wrist", [1.0]), "data.fold=0")])
-    jobs = jobs_table({"0": JobOutcome("", "data.fold=0", failure="out of memory")}, {})
+    jobs = jobs_table({"1": JobOutcome("", "data.fold=1", failure="out of memory")}, {})
     keep_table(table, jobs, tmp_path, store, run_id, ["1 of 2 jobs are missing"])
     shown = (tmp_path / RESULTS_PAGE).read_text()
     assert "<p>1 of 2 jobs are missing</p>" in shown
-    assert "out of memory" in shown.partition("<h2>Jobs</h2>")[2]
+    of_jobs = shown.partition("<h2>Jobs</h2>")[2]
+    assert "data.fold=1" in of_jobs
+    assert "failed" in of_jobs
     assert store.get_run(run_id).data.tags[NOTE_TAG].startswith("1 of 2 jobs are missing\n\n")
 
 
