@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
@@ -14,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from armscan.stats.bootstrap import LEVEL, N_RESAMPLES, Estimate
+from armscan.tracking.sanitize import name_of
 from armscan.training import Evaluation, MetricEstimates, ResultTable
 from armscan.training.baselines import RANDOM
 from armscan.training.headline import beside_random, headline
@@ -22,8 +22,6 @@ from armscan.training.metrics import LEAST_SURE, NOT_STARTED_SOLVED, SUREST
 from armscan.utils.rate_text import formatted
 
 TOTAL = "all volumes"
-# Characters that MLflow refuses in the name of a metric.
-REFUSED_BY_MLFLOW = re.compile(r"[^A-Za-z0-9_\-. /:]")
 AGENT = "agent"
 # Metrics for which the table of results has no room.
 FURTHER_ROWS = (
@@ -130,7 +128,7 @@ class EvaluationReport:
         groups = {label.replace(" ", "_"): metrics.metrics() for label, metrics in self.by_split.items()}
         for volumes in self.by_volume.values():
             for name, metrics in volumes.items():
-                groups[f"volume/{REFUSED_BY_MLFLOW.sub('_', name)}"] = metrics.metrics()
+                groups[name_of(f"volume/{name}")] = metrics.metrics()
         shown = {label: [column.metric for column in table.quantities] for label, table in self.tables().items()}
         for name, by_split in self.baselines_by_split.items():
             for label, names in shown.items():

@@ -41,6 +41,8 @@ TITLES = {
 }
 # Every evaluation tracks this metric, below the name of its group; `NAMES` maps groups to the names of their volumes.
 EVALUATED = "/success_rate"
+# Of the metrics of a single volume in an evaluation.
+VOLUME_PREFIX = "volume/"
 NAMES = {name.replace(" ", "_"): name for name in (TEST, TRAINING)} | {"validation": LAST_VALIDATION}
 # Metrics of a run's MLflow model, besides the on-plane rates.
 OF_MODEL = ("median_distance_mm", "median_distance_deg", "success_rate", "mean_steps")
@@ -150,13 +152,30 @@ def figures_of(metrics: Mapping[str, float]) -> dict[str, MetricEstimates]:
     Args:
         metrics: Metrics of the run, by name; those of single volumes are left out.
     """
-    evaluated = (name.removesuffix(EVALUATED) for name in metrics if name.endswith(EVALUATED))
     return {
-        NAMES.get(group, group.replace("_", " ")): MetricEstimates.of_metrics(
+        NAMES.get(group, group.replace("_", " ")): figures
+        for group, figures in _by_group(metrics).items()
+        if "/" not in group and group != "train"
+    }
+
+
+def evaluation_table(metrics: Mapping[str, float]) -> ResultTable:
+    """Return the table of what `armscan evaluate` has tracked: the agent and the baselines on each group of volumes."""
+    titled = {}
+    for group, figures in _by_group(metrics).items():
+        if not group.startswith(VOLUME_PREFIX):
+            baseline, _, volumes = group.rpartition("/")
+            titled[f"{baseline or AGENT}, {volumes.replace('_', ' ')}"] = figures
+    return ResultTable(titled)
+
+
+def _by_group(metrics: Mapping[str, float]) -> dict[str, MetricEstimates]:
+    groups = [name.removesuffix(EVALUATED) for name in metrics if name.endswith(EVALUATED)]
+    return {
+        group: MetricEstimates.of_metrics(
             {name.removeprefix(f"{group}/"): each for name, each in metrics.items() if name.startswith(f"{group}/")}
         )
-        for group in evaluated
-        if "/" not in group and group != "train"
+        for group in groups
     }
 
 

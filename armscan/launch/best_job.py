@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from mlflow.entities import Metric, Run, RunTag
 
 from armscan.config.defaults import FOLD
-from armscan.stats.on_plane import ON_PLANE, PREFIX
+from armscan.stats.on_plane import leading_of
 from armscan.tracking import TrackingStore
 from armscan.tracking.outbox import now_ms
 from armscan.training.baselines import RANDOM
@@ -19,13 +19,10 @@ BEST_TAG = "best.run"
 
 
 def best_of(runs: Sequence[Run]) -> Run | None:
-    """Return the run with the highest on-plane rate on its test volumes; None if no run was evaluated."""
-    names = {name for run in runs for name in run.data.metrics if name.startswith(f"{TESTED}{PREFIX}")}
-    # Other limits, if the configuration replaces the usual ones.
-    usual = f"{TESTED}{ON_PLANE[0].metric}"
-    rate = usual if usual in names or not names else min(names)
-    evaluated = [run for run in runs if rate in run.data.metrics]
-    return max(evaluated, key=lambda run: float(run.data.metrics[rate]), default=None)
+    """Return the run with the highest leading on-plane rate on its test volumes; None if no run was evaluated."""
+    rates = {f"{TESTED}{leading_of(run.data.params).metric}" for run in runs}
+    evaluated = [(run.data.metrics[rate], run) for rate in rates for run in runs if rate in run.data.metrics]
+    return max(evaluated, key=lambda each: float(each[0]), default=(None, None))[1]
 
 
 def show_best(store: TrackingStore, parent_id: str, jobs: Sequence[Run]) -> None:

@@ -119,7 +119,8 @@ def _summary(groups: Sequence[Group]) -> str:
         for group, colour in zip(groups, colours(len(groups)), strict=True)
     ]
     counted = f"{_counted(n_trainings, 'run')} in {_counted(len(groups), 'group')}"
-    return f"<p>{counted}: those of a group differ by nothing but {by}.</p>{table(rows, what='groups')}"
+    same = "" if all(group.has_same_volumes for group in groups) else ", except for their volumes"
+    return f"<p>{counted}: those of a group differ by nothing but {by}{same}.</p>{table(rows, what='groups')}"
 
 
 def _seed_and_fold(training: TrackedTraining) -> str:

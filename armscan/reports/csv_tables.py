@@ -73,8 +73,8 @@ def _final_rows(groups: Sequence[Group], reached: Sequence[MetricEstimates | Non
     for group, figures in zip(groups, reached, strict=True):
         if figures is None:
             continue
-        for name, estimate in figures.estimates.items():
-            yield {"group": group.name, "seeds": figures.n_seeds, "figure": name, **estimate._asdict()}
+        for name in figures.estimates:
+            yield {"group": group.name, "seeds": figures.n_seeds, "figure": name, **figures.estimate(name)._asdict()}
 
 
 def _volume_rows(groups: Sequence[Group]) -> Iterator[Row]:

@@ -48,6 +48,12 @@ class Group:
         return len({training.fold for training in self.trainings if training.fold is not None})
 
     @property
+    def has_same_volumes(self) -> bool:
+        """Whether all of its trainings had the same volumes, or those of their fold, as far as that is known."""
+        of_fold = {training.fold: training.volumes for training in self.trainings if training.volumes is not None}
+        return all(training.volumes in (None, of_fold.get(training.fold)) for training in self.trainings)
+
+    @property
     def title(self) -> str:
         """Number and name."""
         return f"{self.number}. {self.name}"

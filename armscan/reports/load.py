@@ -15,14 +15,14 @@ from mlflow.store.artifact.artifact_repository_registry import get_artifact_repo
 from armscan.config.defaults import FOLD, FOLDS
 from armscan.config.legacy import migrate
 from armscan.errors import TrackingError
-from armscan.reports.select import SelectedRun
 from armscan.stats.on_plane import leading_of, limits_among
 from armscan.tracking import TrackingStore
 from armscan.tracking.histories import History, metric_histories
 from armscan.tracking.run import PRUNED
 from armscan.tracking.store import store_errors
-from armscan.tracking.tags import CHOICE
+from armscan.tracking.tags import CHOICE, PRUNED_TAG
 from armscan.training import TEST, Evaluation
+from armscan.training.fingerprints import Fingerprints, fingerprints_in
 from armscan.utils.arrays import FloatArray
 from armscan.utils.files import BASELINES_FILE, EVALUATION_FILE, ID_CHARS, SHA256_TAGS, VIDEO_FILE, VOLUMES_FILE, sha256
 
@@ -35,7 +35,6 @@ VALIDATION = {
 OF_VALIDATION = "validation/"
 # Prefixes of the other metrics that are drawn.
 OF_THE_TRAINING = ("update/", "train/return", "train/length", "speed/")
-BUDGET = "training.env_steps"
 # MLflow's value of a parameter that is not set.
 UNSET = "None"
 T = TypeVar("T")
@@ -63,7 +62,7 @@ class TrackedTraining:
     Args:
         run_id: MLflow run ID.
         name: Name of the run.
-        status: Status of the run, in lower case; `pruned` if its trial was.
+        status: Status of the run, in lower case; `pruned` if it was cut off with its trial.
         started_ms: Start time, in ms since 1970.
         is_whole: Whether it has run to its end: not pruned, failed or still running.
         params: Its configuration, by dotted keys.
@@ -71,7 +70,7 @@ class TrackedTraining:
         series: Curves by the name of the metric.
         evaluation: Final evaluation on the test volumes; None if it has kept none.
         baselines: Episodes of the baselines on the test volumes, by their names. Default: none, as in older runs.
-        volumes: Fingerprints of its test volumes by name; None if it has kept none.
+        volumes: Fingerprints of its volumes by split (training, validation, test) and name; None if it has kept none.
         video: Episode as an animated GIF; None if it has kept none.
     """
 
@@ -85,7 +84,7 @@ class TrackedTraining:
     series: Mapping[str, Series] = field(repr=False)
     evaluation: Evaluation | None = field(repr=False)
     baselines: Mapping[str, Evaluation] = field(default_factory=dict, repr=False)
-    volumes: Mapping[str, str] | None = field(repr=False)
+    volumes: Fingerprints | None = field(repr=False)
     video: bytes | None = field(repr=False)
 
     @property
@@ -138,46 +137,44 @@ def validation_titles(names: Iterable[str]) -> dict[str, str]:
     return titles | {name: title for name, title in VALIDATION.items() if name in known}
 
 
-def read_trainings(store: TrackingStore, found: Sequence[SelectedRun], folder: Path) -> list[TrackedTraining]:
+def read_trainings(store: TrackingStore, runs: Sequence[Run], folder: Path) -> list[TrackedTraining]:
     """Load the trainings of runs.
 
     Args:
         store: Store of the runs.
-        found: Runs to load.
+        runs: Runs to load.
         folder: Folder that their files are downloaded to.
 
     Raises:
         TrackingError: If one of their files is damaged, or the store cannot be used.
     """
-    runs = [each.run for each in found]
     with store_errors(store.uri):
         histories = metric_histories(store, {run.info.run_id: _wanted(run) for run in runs})
         files = [_files(store, run, folder / run.info.run_id) for run in runs]
-    return [_training(each, histories[each.run.info.run_id], of_run) for each, of_run in zip(found, files, strict=True)]
+    return [_training(run, histories[run.info.run_id], of_run) for run, of_run in zip(runs, files, strict=True)]
 
 
-def _training(found: SelectedRun, histories: Mapping[str, History], files: Mapping[str, bytes]) -> TrackedTraining:
-    run, tags = found.run, found.run.data.tags
-    series = _series(histories)
+def _training(run: Run, histories: Mapping[str, History], files: Mapping[str, bytes]) -> TrackedTraining:
+    tags, series = run.data.tags, _series(histories)
     evaluation = _parsed(run, files, EVALUATION_FILE, lambda contents: Evaluation.of_dict(contents[TEST]))
     baselines = _parsed(
         run, files, BASELINES_FILE, lambda contents: {name: Evaluation.of_dict(each) for name, each in contents.items()}
     )
     params = migrate(run.data.params)
-    n_env_steps = max((series[name].env_steps[-1] for name in validation_titles(series)), default=0.0)
-    is_cut = found.is_pruned and n_env_steps < float(params.get(BUDGET, "inf"))
+    # The tag of its own run: other seeds of a pruned trial may have run to their end.
+    is_pruned = PRUNED_TAG in tags
     return TrackedTraining(
         run_id=run.info.run_id,
         name=(run.info.run_name or run.info.run_id).removesuffix(PRUNED),
-        status="pruned" if is_cut and run.info.status == "FINISHED" else run.info.status.lower(),
+        status="pruned" if is_pruned and run.info.status == "FINISHED" else run.info.status.lower(),
         started_ms=run.info.start_time or 0,
-        is_whole=run.info.status == "FINISHED" and not is_cut,
+        is_whole=run.info.status == "FINISHED" and not is_pruned,
         params=params,
         choices={tag.removeprefix(CHOICE): value for tag, value in sorted(tags.items()) if tag.startswith(CHOICE)},
         series=series,
         evaluation=evaluation if evaluation and evaluation.episodes else None,
         baselines=baselines or {},
-        volumes=_parsed(run, files, VOLUMES_FILE, lambda contents: dict(contents["test"])),
+        volumes=_parsed(run, files, VOLUMES_FILE, lambda contents: fingerprints_in(contents, VOLUMES_FILE)),
         video=files.get(VIDEO_FILE),
     )
 

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 
 from armscan.reports.groups import Group, differing_rules
 from armscan.reports.load import TrackedTraining
+from armscan.reports.significance import evaluations_by_seed
 from armscan.stats.aggregation import MIN_SEEDS
 
 # From this number of seeds on, the intervals of final figures are nearly as wide as they should be.
@@ -20,6 +21,7 @@ def notes_on(groups: Sequence[Group], left_out: Sequence[TrackedTraining], *, ha
         *_on_seeds(groups),
         *_on_unfinished(groups),
         *_on_missing(groups),
+        *_on_volumes(groups),
         *_on_rules(groups, has_other_volumes=has_other_volumes),
     ]
     if left_out:
@@ -39,12 +41,14 @@ def _on_folds(groups: Sequence[Group]) -> Iterator[str]:
 
 
 def _on_seeds(groups: Sequence[Group]) -> Iterator[str]:
-    if single := [group.number for group in groups if group.n_seeds == 1]:
+    # Seeds of a search are not tested.
+    n_seeds = {group.number: len(evaluations_by_seed(group)) or group.n_seeds for group in groups}
+    if single := [number for number, n in n_seeds.items() if n == 1]:
         yield (
             f"{_numbered(single, groups)}: one seed says nothing about other seeds; intervals cover volumes and "
             "episodes only."
         )
-    if few := [group.number for group in groups if 1 < group.n_seeds < MANY_SEEDS]:
+    if few := [number for number, n in n_seeds.items() if 1 < n < MANY_SEEDS]:
         yield (
             f"{_numbered(few, groups)}: with few seeds the intervals of the final figures are too narrow; those of "
             f"curves (from {MIN_SEEDS} seeds on) and of the probabilities below are not."
@@ -67,6 +71,14 @@ def _on_missing(groups: Sequence[Group]) -> Iterator[str]:
                 of_files.setdefault(file, []).append(_named(group, training))
     for file, which in of_files.items():
         yield f"No {file} is among the artifacts of {'; '.join(which)}."
+
+
+def _on_volumes(groups: Sequence[Group]) -> Iterator[str]:
+    if other := [group.number for group in groups if not group.has_same_volumes]:
+        yield (
+            f"{_numbered(other, groups)}: the runs did not have the same volumes (volumes.json): some were changed, added "
+            "or removed between them, and the figures mix them."
+        )
 
 
 def _on_rules(groups: Sequence[Group], *, has_other_volumes: bool) -> Iterator[str]:

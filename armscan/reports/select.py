@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 from mlflow.entities import Run
 
@@ -11,24 +10,11 @@ from armscan.errors import InvalidValueError, TrackingError, listed
 from armscan.tracking import TrackingStore, check_version, find_run
 from armscan.tracking.run import MAX_DEPTH
 from armscan.tracking.store import store_errors
-from armscan.tracking.tags import AGENT_TAG, EVALUATED_TAG, JOB_TAG, PARENT_TAG, PRUNED_TAG, TRIAL_TAG
+from armscan.tracking.tags import AGENT_TAG, EVALUATED_TAG, JOB_TAG
 
 # Prefix that names a whole experiment of MLflow instead of a run.
 EXPERIMENT = "experiment:"
 N_SHOWN = 6
-
-
-@dataclass(frozen=True)
-class SelectedRun:
-    """A training that was found.
-
-    Args:
-        run: Run of the training.
-        is_pruned: Whether the run belongs to a pruned trial.
-    """
-
-    run: Run
-    is_pruned: bool
 
 
 def read_runs(text: str) -> list[str]:
@@ -45,7 +31,7 @@ def read_runs(text: str) -> list[str]:
     return list(dict.fromkeys(named))
 
 
-def find_trainings(store: TrackingStore, named: Sequence[str]) -> list[SelectedRun]:
+def find_trainings(store: TrackingStore, named: Sequence[str]) -> list[Run]:
     """Return the named trainings, each once: in the order of the names, then of their starts.
 
     Args:
@@ -60,7 +46,9 @@ def find_trainings(store: TrackingStore, named: Sequence[str]) -> list[SelectedR
         for name in named:
             trainings = _in_experiment(store, name) if name.startswith(EXPERIMENT) else _meant(store, name)
             found |= {run.info.run_id: run for run in trainings}
-        return _selected(store, list(found.values()))
+        for run in found.values():
+            check_version(run)
+        return list(found.values())
 
 
 def _meant(store: TrackingStore, name: str) -> list[Run]:
@@ -101,20 +89,3 @@ def _in_experiment(store: TrackingStore, name: str) -> list[Run]:
     if not trainings:
         raise TrackingError(f"the experiment is {wanted!r}, but in {store.uri!r} it has no armscan training")
     return trainings
-
-
-def _selected(store: TrackingStore, runs: Sequence[Run]) -> list[SelectedRun]:
-    """Return the trainings, each with whether its trial was pruned."""
-    for run in runs:
-        check_version(run)
-    trials = {
-        run.info.run_id: (run.info.experiment_id, run.data.tags[PARENT_TAG])
-        for run in runs
-        if TRIAL_TAG in run.data.tags and PARENT_TAG in run.data.tags
-    }
-    pruned = {
-        (experiment_id, each.info.run_id)
-        for experiment_id in {experiment_id for experiment_id, _ in trials.values()}
-        for each in store.runs([experiment_id], f"tags.`{PRUNED_TAG}` IS NOT NULL")
-    }
-    return [SelectedRun(run, trials.get(run.info.run_id) in pruned) for run in runs]

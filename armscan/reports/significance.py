@@ -119,7 +119,8 @@ def _volumes(group: Group) -> Mapping[str, str | None] | None:
     of_seeds: dict[str, dict[str, str | None]] = defaultdict(dict)
     for training in group.trainings:
         if training.evaluation is not None:
-            prints = {name: (training.volumes or {}).get(name) for name in training.evaluation.by_volume()}
+            known = (training.volumes or {}).get("test", {})
+            prints = {name: known.get(name) for name in training.evaluation.by_volume()}
             of_seeds[training.seed or training.run_id] |= prints
     first, *others = of_seeds.values() or [None]
     return first if all(_are_same(first, each) for each in others) else None

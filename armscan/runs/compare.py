@@ -10,9 +10,10 @@ from typing import Any
 from armscan.tracking.client import TrackingStore
 from armscan.tracking.histories import metric_histories
 from armscan.tracking.system_metrics import PREFIX
+from armscan.tracking.tags import SELECTION_PREFIX
 
-# Prefixes of metrics of time and machine, which differ from run to run.
-TIMES = (PREFIX, "speed/", "wall_s", "training_s")
+# Prefixes of metrics of time and machine, which differ from run to run, and of those that a reproduction lacks.
+LEFT_OUT = (PREFIX, "speed/", "wall_s", "training_s", SELECTION_PREFIX)
 N_SHOWN = 10
 
 
@@ -94,9 +95,12 @@ class Comparison:
 
 
 def compare_runs(store: TrackingStore, first_id: str, second_id: str) -> Comparison:
-    """Compare all metrics of two runs of a store, except those of time and machine; the original run comes first."""
+    """Compare the metrics of two runs of a store, the original first.
+
+    Those of time and machine are left out, and those that only a study measures, which a reproduction does not.
+    """
     names = {
-        run_id: [name for name in store.get_run(run_id).data.metrics if not name.startswith(TIMES)]
+        run_id: [name for name in store.get_run(run_id).data.metrics if not name.startswith(LEFT_OUT)]
         for run_id in (first_id, second_id)
     }
     histories = metric_histories(store, names)

@@ -11,15 +11,15 @@ from typing import Any, Self
 from armscan.config.command_hints import armscan_command
 from armscan.errors import TrackingError
 from armscan.evaluation import EvaluationReport
-from armscan.evaluation.report import REFUSED_BY_MLFLOW
+from armscan.evaluation.report import TOTAL
 from armscan.tracking import FoundRun
+from armscan.tracking.sanitize import name_of
 from armscan.tracking.tags import EVALUATED_TAG
 from armscan.training import ON_PLANE, TEST, Evaluation, ResultTable
 from armscan.utils.files import BASELINES_FILE, EVALUATION_FILE
 
 # Longest description that MLflow's databases accept.
 MAX_CHARS = 5000
-OWN_VOLUMES = "own volumes"
 TAGGED = (
     *("median_distance_mm", "median_distance_deg", "success_rate", "mean_steps"),
     *("mean_distance_mm", "mean_distance_deg", "mean_dice"),
@@ -56,7 +56,8 @@ class Card:
             text += f"\n\nNot evaluated yet: run `{command}`."
         tags: dict[str, str] = {}
         for title, report in reports.items():
-            section = f"\n\n### {title}\n\n{_table(report).markdown()}"
+            notes = "".join(f"\n\nNote: {note}." for note in report.facts.get("notes", ()))
+            section = f"\n\n### {title}\n\n{_table(report).markdown()}{notes}"
             # If there is no room for both, the run's own evaluation stays.
             if len(text + section) <= MAX_CHARS:
                 text += section
@@ -95,7 +96,9 @@ def _read(run: FoundRun, run_id: str, file: str, folder: Path) -> EvaluationRepo
     """Return the evaluation in an artifact, of the run itself or of one by `armscan evaluate`."""
     contents = _json(run, run_id, file, folder)
     try:
-        facts = {key: contents[key] for key in ("data", "changes") if run_id != run.run_id}
+        facts = {}
+        if run_id != run.run_id:
+            facts = {"data": contents["data"], "changes": contents["changes"], "notes": contents.get("notes", [])}
         if run_id == run.run_id:
             evaluations = {label: Evaluation.of_dict(each) for label, each in contents.items()}
             baselines = _own_baselines(run, folder)
@@ -106,11 +109,12 @@ def _read(run: FoundRun, run_id: str, file: str, folder: Path) -> EvaluationRepo
             baselines = {name: _evaluations(each["episodes"], limits) for name, each in kept.items()}
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise _damaged(run_id, file) from error
-    is_read = not facts or (isinstance(facts["data"], str) and isinstance(facts["changes"], dict))
+    kinds = {"data": str, "changes": dict, "notes": list}
+    is_read = all(isinstance(value, kinds[key]) for key, value in facts.items())
     played = [*evaluations.values(), *(each for by_label in baselines.values() for each in by_label.values())]
     if not (is_read and evaluations and all(evaluation.episodes for evaluation in played)):
         raise _damaged(run_id, file)
-    has_total = facts.get("data", OWN_VOLUMES) != OWN_VOLUMES
+    has_total = TOTAL in contents.get("splits", ())
     return EvaluationReport(evaluations, has_total=has_total, facts=facts, baselines=baselines)
 
 
@@ -148,7 +152,7 @@ def _damaged(run_id: str, file: str) -> TrackingError:
 
 def _tags(report: EvaluationReport) -> dict[str, str]:
     return {
-        f"{REFUSED_BY_MLFLOW.sub('_', label.replace(' ', '_'))}/{name}": f"{estimate.value:.4g}"
+        name_of(f"{label.replace(' ', '_')}/{name}"): f"{estimate.value:.4g}"
         for label, figures in report.by_split.items()
         for name in (*(limits.metric for limits in figures.on_plane), *TAGGED)
         if (estimate := figures.estimates[name]).value == estimate.value

@@ -12,7 +12,7 @@ from rich.text import Text
 from armscan.config.command_hints import armscan_command, resume_command
 from armscan.config.trust import TRUST, needs_trust
 from armscan.errors import printable
-from armscan.experiment.results import figures_of, result_table
+from armscan.experiment.results import evaluation_table, figures_of, result_table
 from armscan.runs.rows import RunRow, artifacts_of
 from armscan.runs.run_folder import OwnFolder, RunSkippedError
 from armscan.runs.tables import format_duration, narrow_table
@@ -84,10 +84,11 @@ def _print_pairs(console: Console, title: str, pairs: dict[str, str], right: str
 
 def _print_figures(console: Console, run: Run) -> None:
     """Print the final evaluations, the baselines and the last validation; not those of single volumes."""
-    figures = figures_of(run.data.metrics)
-    if figures:
+    metrics = run.data.metrics
+    table = evaluation_table(metrics) if EVALUATED_TAG in run.data.tags else result_table(figures_of(metrics))
+    if table.results:
         console.print("\nfigures", style="bold")
-        for part in result_table(figures).show(console.width):
+        for part in table.show(console.width):
             console.print(part)
 
 

@@ -19,3 +19,5 @@ FAILURE_TAG = "failure"
 JOB_TAG, GRID_TAG = "job", "grid"
 # Of a study's runs: its name and storage, the number of the trial, and whether the trial was pruned.
 STUDY_TAG, STORAGE_TAG, TRIAL_TAG, PRUNED_TAG = "study", "study.storage", "trial", "pruned"
+# Prefix of metrics that a study measures to select a configuration; no other run has them.
+SELECTION_PREFIX = "selection/"

@@ -129,11 +129,14 @@ class Evaluation:
         return cls(tuple(_episode_of(each) for each in episodes), check_on_plane("on_plane", on_plane))
 
     @classmethod
-    def pooled(cls, evaluations: Sequence[Evaluation]) -> Self:
+    def pooled(cls, evaluations: Sequence[Self]) -> Self:
         """Return the episodes of one or more evaluations together, with the limits of the first.
 
-        All volumes count equally: of each, only the first episodes are kept, as many as the least played volume has.
+        Of several, all volumes count equally: of each, only the first episodes are kept, as many as the least played
+        volume has.
         """
+        if len(evaluations) == 1:
+            return evaluations[0]
         n_played = Counter(episode.volume for each in evaluations for episode in each.episodes)
         n_kept, n_seen = min(n_played.values(), default=0), Counter[str]()
         episodes = []

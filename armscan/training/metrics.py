@@ -134,18 +134,15 @@ class MetricEstimates:
         return self.estimates.get(name + WILSON, estimate) if estimate.low == estimate.high else estimate
 
     def metrics(self) -> dict[str, float]:
-        """Return all numbers by name, the ends of an interval as `..._low` and `..._high`."""
-        return self._metrics(self.estimates)
+        """Return all numbers by name as they are shown, the ends of an interval as `..._low` and `..._high`."""
+        return self.shown_metrics(self.estimates)
 
     def shown_metrics(self, names: Iterable[str]) -> dict[str, float]:
         """Return the numbers of these figures as they are shown; see `metrics`."""
-        return self._metrics({name: self.estimate(name) for name in names})
-
-    def _metrics(self, estimates: Mapping[str, Estimate]) -> dict[str, float]:
         counts = (self.n_volumes, self.n_episodes, self.n_started_solved)
         metrics: dict[str, float] = dict(zip(COUNTS, counts, strict=True))
-        for name, estimate in estimates.items():
-            metrics |= dict(zip((name, *(name + end for end in ENDS)), estimate, strict=True))
+        for name in names:
+            metrics |= dict(zip((name, *(name + end for end in ENDS)), self.estimate(name), strict=True))
         return metrics
 
 

@@ -13,6 +13,8 @@ from armscan.utils.validation import check_float, check_int, check_seed
 from armscan.volumes import Dataset
 
 DEFAULT_SHARE = 0.25
+# 0.28 of 25 is a little above 7 in floats, and not to be rounded up to 8.
+ROUNDING = 1e-9
 # Choice of phantoms instead of subjects.
 PHANTOMS = "phantoms"
 LEAVE_ONE_OUT = "leave_one_out"
@@ -114,7 +116,7 @@ def _drawn(dataset: Dataset, wanted: Wanted, path: str, split_seed: int) -> dict
     drawn = iter(np.random.default_rng(check_seed("data.split_seed", split_seed)).permutation(len(left)))
     n_subjects = len(set(subjects.values()))
     for part, share in shares.items():
-        chosen = {left[index] for index in islice(drawn, math.ceil(share * n_subjects))}
+        chosen = {left[index] for index in islice(drawn, math.ceil(share * n_subjects - ROUNDING))}
         parts |= {volume: part for volume, subject in subjects.items() if subject in chosen}
     parts = {volume: parts.get(volume, "train") for volume in subjects}
     _check_subjects(parts, subjects)

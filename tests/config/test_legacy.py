@@ -133,11 +133,10 @@ def test_killed_run_is_resumed_and_its_policy_exported(legacy, tmp_path):
 
 def test_old_and_new_runs_have_the_same_keys_in_a_comparison(legacy, tmp_path):
     from armscan.reports.load import read_trainings
-    from armscan.reports.select import SelectedRun
     from armscan.tracking import open_existing_store
 
     store = open_existing_store(legacy)
-    (training,) = read_trainings(store, [SelectedRun(store.get_run(FINISHED), False)], tmp_path)
+    (training,) = read_trainings(store, [store.get_run(FINISHED)], tmp_path)
     assert training.params["agent.learning_starts"] == "200"
     assert not set(training.params) & set(RENAMED_KEYS)
 

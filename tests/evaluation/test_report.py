@@ -38,3 +38,18 @@ def test_tables_of_agents_without_doubt_say_nothing_of_it(doubting):
     text = printed(replace(each, expected_mm=None, expected_deg=None) for each in doubting)
     assert "quarter" not in text
     assert "expected" not in text
+
+
+def test_metrics_of_volumes_with_similar_names_stay_apart():
+    (usual,) = evaluation_of(3).episodes
+    episodes = [replace(usual, volume=name, n_steps=n_steps) for n_steps, name in enumerate(("a(1)", "a[1]"), 1)]
+    report = EvaluationReport({"volumes": Evaluation(tuple(episodes))}, has_total=False, facts={})
+    of_volumes = [metrics for group, metrics in report.metrics().items() if group.startswith("volume/")]
+    assert [metrics["mean_steps"] for metrics in of_volumes] == [1.0, 2.0]
+
+
+def test_metrics_have_the_intervals_that_the_table_shows():
+    report = EvaluationReport({"volumes": evaluation_of(*[2] * 8)}, has_total=False, facts={})
+    shown = report.by_split["volumes"].estimate("success_rate")
+    assert shown.low < shown.value == 1.0
+    assert report.metrics()["volumes"]["success_rate_low"] == shown.low

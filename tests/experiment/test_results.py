@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from armscan.experiment.results import RunResult, volume_notes
+from armscan.experiment.results import RunResult, evaluation_table, volume_notes
 from armscan.training import TEST, TRAINING, Evaluation, MetricEstimates
 from tests.training.test_result_table import made_episodes
 
@@ -37,3 +37,14 @@ def test_validation_that_no_interval_shares_with_the_test_is_said_in_one_line():
     )
     (note,) = volume_notes(on_plane, off_plane)
     assert "0% on the validation and 100% on the test volumes, and the intervals do not overlap" in note
+
+
+def test_table_of_an_evaluation_names_the_volumes_of_each_figure():
+    groups = ("train_split", "test_split", "random/test_split", "volume/a", "volume/a/b")
+    metrics = {f"{group}/success_rate": number / 10 for number, group in enumerate(groups)}
+    table = evaluation_table(metrics)
+    assert {title: figures.estimate("success_rate").value for title, figures in table.results.items()} == {
+        "agent, train split": 0.0,
+        "agent, test split": 0.1,
+        "random, test split": 0.2,
+    }

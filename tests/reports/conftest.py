@@ -83,7 +83,7 @@ def make_training():
             "choices": choices or {"agent": "sac"},
             "series": {"validation/success_rate": series, "validation/mean_steps": series} if len(steps) else {},
             "evaluation": Evaluation(tuple(make_episode(f"v{i % 2}", mean_steps) for i in range(4))),
-            "volumes": {"v0": "a", "v1": "b"},
+            "volumes": {"training": {}, "test": {"v0": "a", "v1": "b"}},
             "video": b"GIF89a",
         }
         return TrackedTraining(**facts | changes)

@@ -63,7 +63,7 @@ def test_fewer_steps_are_better_and_equal_ones_are_no_difference(make_training):
 
 @pytest.mark.parametrize(
     ("volumes", "is_compared"),
-    [({"v0": "a", "v1": "b"}, True), ({"v0": "a", "v1": "c"}, False), (None, True)],
+    [({"test": {"v0": "a", "v1": "b"}}, True), ({"test": {"v0": "a", "v1": "c"}}, False), (None, True)],
     ids=["same", "other", "unknown"],
 )
 def test_groups_judged_on_other_volumes_are_not_compared(written, make_training, volumes, is_compared):
@@ -144,7 +144,7 @@ def test_folds_of_a_grid_are_one_configuration_with_intervals_by_wrist(written, 
             params={"data.folds": "leave_one_out", "data.fold": str(number)},
             run_id=f"{10 * seed + number:032x}",
             evaluation=Evaluation(tuple(make_episode(volume, mean_steps) for _ in range(4))),
-            volumes={volume: volume},
+            volumes={"test": {volume: volume}},
         )
 
     trainings = [fold(seed, number, steps) for seed in range(2) for number, steps in enumerate((2, 4, 9))]
@@ -158,3 +158,27 @@ def test_folds_of_a_grid_are_one_configuration_with_intervals_by_wrist(written, 
     page, _ = written(*trainings)
     assert "cross-validation of 3 folds" in page
     assert "differ by nothing but the seed and the fold" in page
+
+
+@pytest.mark.parametrize("part", ["training", "test"])
+def test_runs_of_a_group_that_had_other_volumes_are_told(written, make_training, part):
+    usual = make_training(0)
+    other = make_training(1, volumes=usual.volumes | {part: usual.volumes[part] | {"v1": "changed"}})
+    page, _ = written(usual, other)
+    assert "the runs did not have the same volumes" in page
+    assert "differ by nothing but the seed, except for their volumes" in page
+    page, _ = written(usual, make_training(1), make_training(2, volumes=None))
+    assert "the same volumes" not in page
+    assert "differ by nothing but the seed." in page
+
+
+def test_figures_of_one_evaluation_are_of_all_its_episodes(make_training):
+    episodes = [make_episode("a", 2), make_episode("b", 2), make_episode("b", 8)]
+    (group,), _ = group_trainings([make_training(evaluation=Evaluation(tuple(episodes)))])
+    figures = final_metrics(group)
+    assert (figures.n_episodes, figures.estimates["mean_steps"].value) == (3, 4.0)
+
+
+def test_one_tested_seed_is_told_also_among_seeds_that_were_only_searched_with(written, make_training):
+    page, _ = written(make_training(0), *(make_training(seed, evaluation=None) for seed in range(1, 6)))
+    assert "one seed says nothing about other seeds" in page

@@ -15,6 +15,7 @@ from armscan.runs.run_folder import RunSkippedError
 from armscan.tracking import open_store
 from armscan.tracking.outbox import file_of
 from armscan.utils.files import LOCK_FILE
+from tests.support.refusals import assert_refused
 from tests.test_run import REPOSITORY
 
 
@@ -53,10 +54,9 @@ def test_runs_answers_mistakes_in_one_line(answer, make_run, tmp_path):
         (["prune", "folders", "--apply=yes please"], "Option '--apply' does not take a value."),
         (["prune", "folders", "--format=csv"], "No such option '--format'."),
     ):
-        code, printed, errors = answer(*words)
-        assert (code, printed) == (2, ""), words
-        assert errors.startswith(f"error: {line}"), (words, errors)
-        assert len(errors.splitlines()) == 1, errors
+        refused = answer(*words)
+        assert refused[1] == "", words
+        assert_refused(refused, line)
     assert (tmp_path / "outputs" / "tiny" / "best.pt").exists()
 
 

@@ -93,3 +93,15 @@ def test_damaged_evaluation_by_the_command_is_one_line(keep, tmp_path, contents)
         TrackingError, match=rf"^run {latest}: its figures\.json is damaged; put it back, or remove it$"
     ):
         card_of(run_id, tmp_path)
+
+
+@pytest.mark.parametrize("has_total", [False, True])
+def test_card_pools_volumes_only_where_the_evaluation_did_and_has_its_notes(keep, tmp_path, has_total):
+    run_id = keep("evaluation.json", json.dumps(OWN))
+    facts = FACTS | {"data": "folder", "notes": ["the agent was trained on these volumes"]}
+    splits = {"train split": evaluation_of(1), "test split": evaluation_of(9)}
+    keep("figures.json", json.dumps(EvaluationReport(splits, has_total=has_total, facts=facts).to_dict()), run_id)
+    card = card_of(run_id, tmp_path)
+    assert ("all volumes" in card.text) == has_total
+    assert ("all_volumes/mean_steps" in card.tags) == has_total
+    assert "Note: the agent was trained on these volumes." in card.text

@@ -79,6 +79,8 @@ def tagged(client, run, name, value):
 
 def test_reproduce_makes_the_same_again_and_tells_when_a_figure_was_another(made, tmp_path):
     folder, client, run = made
+    # As in a training of a study's selection, which a reproduction is not.
+    client.log_metric(run.info.run_id, "selection/mean_steps", 3.0)
     command = [
         sys.executable,
         "-m",

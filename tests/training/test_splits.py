@@ -1,7 +1,9 @@
 """Training, validation and test volumes."""
 
 import json
+from collections import Counter
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from hypothesis import given
 
 from armscan.errors import InvalidValueError
 from armscan.training import Split, mixed_data, nifti_data, phantom_data
+from armscan.training.subject_splits import _drawn
 from tests.volumes.test_damaged import SETTINGS, anything, is_answered
 
 
@@ -265,3 +268,10 @@ def test_mixed_data_is_judged_on_ones_own_subjects_with_phantoms_beside_the_trai
         assert [first[0]] == validation
     else:
         assert "f.nrrd" not in split.training
+
+
+@pytest.mark.parametrize(("share", "n_chosen"), [(0.28, 7), (0.29, 8)])
+def test_share_of_the_subjects_is_rounded_up_once(share, n_chosen):
+    dataset = SimpleNamespace(subjects={f"v{i}": f"S{i}" for i in range(25)})
+    parts = _drawn(dataset, {"test": share, "validation": 0.2}, "folder", 0)
+    assert Counter(parts.values())["test"] == n_chosen

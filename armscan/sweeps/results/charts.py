@@ -44,7 +44,7 @@ def charts_of(
     complete = [trial for trial in trials if trial.state == TrialState.COMPLETE]
     if any(map(reports_of, trials)):
         for number, objective in enumerate(objectives):
-            heading = f"While training: {title_of(objective)}"
+            heading = f"While training: {html.escape(title_of(objective))}"
             yield _titled(
                 heading, _reports(trials, number, objective), "A line for each trial, seeds one after another."
             )

@@ -135,7 +135,8 @@ def _result_rows(found: Sequence[ConfigResult]) -> Iterator[Row]:
     """Yield every metric of the result, including those of the baselines."""
     for result in found:
         for of, figures in {"agent": result.figures, **result.baselines}.items():
-            for name, (value, low, high) in figures.estimates.items():
+            for name in figures.estimates:
+                value, low, high = figures.estimate(name)
                 row = {"trial": key_of(result.number), "of": of, "seeds": figures.n_seeds}
                 yield row | {"figure": f"{TEST_PREFIX}{name}", "value": value, "low": low, "high": high}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
@@ -33,7 +34,8 @@ def population_charts(trials: Sequence[FrozenTrial], objective: str, best: Froze
         return
     ancestors = list(lineage(trials, best))
     said = "A point for each trial, a line from the trial that it continued from; orange: those that led to the best."
-    yield f"<h2>Population: {title_of(objective)}</h2><p>{said}</p>{chart(_tree(complete, ancestors, objective))}"
+    heading, tree = html.escape(title_of(objective)), chart(_tree(complete, ancestors, objective))
+    yield f"<h2>Population: {heading}</h2><p>{said}</p>{tree}"
     newest: dict[int, FrozenTrial] = {}
     for trial in sorted(complete, key=lambda each: int(each.user_attrs[GENERATION])):
         newest[trial.user_attrs[MEMBER]] = trial

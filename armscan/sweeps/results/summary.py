@@ -22,7 +22,7 @@ from armscan.training.headline import beside_random
 from armscan.training.metrics import COUNTS
 from armscan.training.result_table import with_baselines
 
-OF_VOLUME = re.compile(r"test/volume/(.+)/(\w+)")
+OF_VOLUME = re.compile(r"test/volume/(.+)/([^/]+)")
 
 
 @dataclass(frozen=True)

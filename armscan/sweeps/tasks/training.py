@@ -26,7 +26,7 @@ from armscan.sweeps.tasks.attempt import Attempt, volumes_of
 from armscan.sweeps.tasks.generation import begin_generation
 from armscan.sweeps.tasks.reporter import TRAINING_METRICS, Reporter
 from armscan.tracking import TrackedRun, draw_learning_curve, open_store, run_of_study, take_over
-from armscan.tracking.tags import PARENT_TAG, STUDY_TAG
+from armscan.tracking.tags import PARENT_TAG, SELECTION_PREFIX, STUDY_TAG
 from armscan.training import (
     TEST,
     VALIDATION,
@@ -100,7 +100,7 @@ def _evaluate_on_validation(
     attempt.keep_episodes({VALIDATION: played})
     metrics = played.metrics()
     tracked.log_metrics(
-        {f"selection/{name}": value for name, value in metrics.items()}, n_env_steps=result.best.n_env_steps
+        {f"{SELECTION_PREFIX}{name}": value for name, value in metrics.items()}, n_env_steps=result.best.n_env_steps
     )
     return metrics
 

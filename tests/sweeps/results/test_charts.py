@@ -1,10 +1,12 @@
 """The charts of a study's report."""
 
+import html
+
 import optuna
 from optuna.study import StudyDirection
 from optuna.trial import create_trial
 
-from armscan.sweeps.results.charts import _history
+from armscan.sweeps.results.charts import _history, charts_of
 
 
 def test_best_so_far_is_of_trials_that_keep_all_constraints():
@@ -18,3 +20,13 @@ def test_best_so_far_is_of_trials_that_keep_all_constraints():
         "infeasible trial": [(1, 1.0)],
         "best so far": [(0, 3.0), (2, 2.0)],
     }
+
+
+def test_names_of_objectives_in_a_storage_are_escaped():
+    study, name = optuna.create_study(), "<script>alert(1)</script>"
+    trial = study.ask()
+    trial.report(1.0, 10)
+    study.tell(trial, 1.0)
+    shown = "".join(charts_of(study, study.trials, [name], []))
+    assert "<script>alert" not in shown
+    assert html.escape(name) in shown

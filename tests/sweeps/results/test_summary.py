@@ -9,7 +9,7 @@ from optuna.trial import TrialState, create_trial
 from scipy.stats import ttest_1samp
 
 from armscan.errors import StudyError
-from armscan.sweeps.results.summary import final_results, final_table
+from armscan.sweeps.results.summary import final_results, final_table, scores_of
 from armscan.sweeps.storage.attribute_names import EPISODES, FINAL_SEED, FINALIST, METRICS
 from armscan.training import Evaluation
 from tests.training.test_result_table import made_episodes, recomputed
@@ -120,3 +120,10 @@ def test_episodes_that_a_stranger_has_written_are_one_line(kept):
     trial = create_trial(value=0.0, user_attrs={FINALIST: 0, FINAL_SEED: 1, METRICS: {}}, system_attrs={EPISODES: kept})
     with pytest.raises(StudyError, match="final training -1: its episodes in the storage"):
         final_results([trial])
+
+
+@pytest.mark.parametrize("metric", ["mean_steps", "on_plane_5mm_10deg", "on_plane_2.5mm_5deg"])
+def test_scores_are_of_each_volume_whatever_the_name_of_the_metric(metric):
+    of_volumes = [f"test/volume/a/b/{metric}", f"test/volume/c/{metric}"]
+    seeds = [dict(zip((f"test/{metric}", *of_volumes), (0.5, seed, 1.0), strict=True)) for seed in (2.0, 3.0)]
+    assert scores_of(f"test/{metric}", seeds).tolist() == [[2.0, 1.0], [3.0, 1.0]]
