@@ -76,8 +76,8 @@ def _on_missing(groups: Sequence[Group]) -> Iterator[str]:
 def _on_volumes(groups: Sequence[Group]) -> Iterator[str]:
     if other := [group.number for group in groups if not group.has_same_volumes]:
         yield (
-            f"{_numbered(other, groups)}: the runs did not have the same volumes (volumes.json): some were changed, added "
-            "or removed between them, and the figures mix them."
+            f"{_numbered(other, groups)}: the runs did not have the same volumes (volumes.json): some were changed, "
+            "added or removed between them, and the figures mix them."
         )
 
 
