@@ -25,7 +25,10 @@ from armscan.utils.files import atomic_write, cache_folder
 
 FOLDER = "baselines"
 # Code that determines how the episodes of the baselines go.
-SOURCES = ("agents/baselines.py", "training/episodes.py", "volumes/**/*.py", "anatomy/**/*.py", "envs/**/*.py")
+SOURCES = (
+    *("agents/baselines.py", "agents/batch_agent.py", "training/episodes.py"),
+    *("volumes/**/*.py", "anatomy/**/*.py", "envs/**/*.py"),
+)
 RANDOM = "random"
 
 
