@@ -20,6 +20,7 @@ from armscan.anatomy import AgreementReward, LandmarkReward, Reward, TissueClust
 from armscan.training.splits import mixed_data
 from armscan.volumes import LabelVolume, ManipulatorAction
 from armscan.volumes.plane import plane_distance
+from benchmarks.tables import print_head, print_row
 
 N_PLANES, OFFSET_MM, ANGLE_DEG = 1000, 10.0, 20.0
 
@@ -70,11 +71,11 @@ def main(folder: str) -> None:
             1e-9,
         ),
     }
-    print("| | accepted, % | median, mm | median, degrees |\n| --- | --- | --- | --- |")
+    print_head("", "accepted, %", "median, mm", "median, degrees")
     for name, distances in distances_of_accepted(list(split.test.values()), rewards).items():
         accepted = [distance for distance in distances if distance is not None]
         median_mm, median_deg = np.median(accepted, axis=0)
-        print(f"| {name} | {100 * len(accepted) / len(distances):.0f} | {median_mm:.1f} | {median_deg:.1f} |")
+        print_row(name, f"{100 * len(accepted) / len(distances):.0f}", f"{median_mm:.1f}", f"{median_deg:.1f}")
 
 
 if __name__ == "__main__":

@@ -27,6 +27,7 @@ from armscan.tracking import find_run, open_existing_store
 from armscan.tracking.tags import AGENT_TAG
 from armscan.training import TEST, evaluate
 from armscan.training.episode_results import EpisodeResult
+from benchmarks.tables import print_head, print_row
 
 N_PHANTOMS, N_GROUPS = 12, 10
 NEAR_MM, NEAR_DEG = 1.5, 4.0
@@ -54,14 +55,14 @@ def played(
     return list(evaluate(prepared.agent, env, n_episodes=n_episodes, seed=FIRST_SEED).episodes)
 
 
-def print_row(name: str, episodes: Sequence[EpisodeResult]) -> None:
+def print_errors(name: str, episodes: Sequence[EpisodeResult]) -> None:
     """Print a row of the table for some episodes."""
     errors = np.array([(each.distance_mm, each.distance_deg) for each in episodes])
     (mm, deg), (mm_90, deg_90) = np.median(errors, axis=0), np.percentile(errors, 90, axis=0)
     near = (errors < (NEAR_MM, NEAR_DEG)).all(axis=1).mean()
     success = np.mean([each.is_success for each in episodes])
-    figures = f"{mm:.2f} / {mm_90:.1f} | {deg:.1f} / {deg_90:.1f} | {100 * near:.0f} | {100 * success:.0f}"
-    print(f"| {name} | {len(episodes)} | {figures} |")
+    figures = f"{mm:.2f} / {mm_90:.1f}", f"{deg:.1f} / {deg_90:.1f}", f"{100 * near:.0f}", f"{100 * success:.0f}"
+    print_row(name, len(episodes), *figures)
 
 
 def print_doubt(episodes: Sequence[EpisodeResult]) -> None:
@@ -74,7 +75,7 @@ def print_doubt(episodes: Sequence[EpisodeResult]) -> None:
         print(f"correlation of expected and real error, {unit}: {np.corrcoef(expected, errors)[0, 1]:.2f}")
         for k, chosen in enumerate(np.array_split(expected.argsort(), N_GROUPS)):
             name = f"decile {k + 1} of expected {unit}, {expected[chosen].mean():.2f}"
-            print_row(name, [episodes[index] for index in chosen])
+            print_errors(name, [episodes[index] for index in chosen])
 
 
 def main() -> None:
@@ -91,11 +92,11 @@ def main() -> None:
     n_each = -(-given.episodes // len(run_ids))
     changes = {"env.transform.rx_deg": given.rx, "agent.n_averaged": given.averaged}
     episodes = [each for run_id in run_ids for each in played(given.tracking, run_id, given.data, n_each, changes)]
-    print("| | episodes | mm, median / p90 | degrees, median / p90 | both < 1.5 mm and < 4 degrees, % | success, % |")
-    print("| --- | --- | --- | --- | --- | --- |")
-    print_row("all", episodes)
+    errors = "mm, median / p90", "degrees, median / p90", "both < 1.5 mm and < 4 degrees, %"
+    print_head("", "episodes", *errors, "success, %")
+    print_errors("all", episodes)
     for name in dict.fromkeys(each.volume for each in episodes):
-        print_row(name, [each for each in episodes if each.volume == name])
+        print_errors(name, [each for each in episodes if each.volume == name])
     print_doubt(episodes)
 
 

@@ -20,6 +20,7 @@ from armscan.anatomy import TissueClusters
 from armscan.training.splits import TEST_FIRST_SEED
 from armscan.volumes import LabelVolume, make_phantom, read_dataset
 from armscan.volumes.phantom import VERSIONS
+from benchmarks.tables import print_head, print_row
 
 PLACES_MM = np.arange(-40, 46)
 BONE, TENDON, ARTERY, NERVE = 1, 2, 3, 4
@@ -118,15 +119,14 @@ def main() -> None:
     ours = ranges(read_dataset(given.data).values())
     seeds = range(TEST_FIRST_SEED, TEST_FIRST_SEED + given.phantoms)
     theirs = [ranges(make_phantom(seed, version) for seed in seeds) for version in VERSIONS]
-    columns = "".join(f" version {version} | inside |" for version in VERSIONS)
-    print(f"| | {given.data} |{columns}\n| --- | --- |{' --- | --- |' * len(VERSIONS)}")
+    print_head("", given.data, *(column for version in VERSIONS for column in (f"version {version}", "inside")))
     for name, values in ours.items():
         cells = [f"{np.nanmin(values):.1f} to {np.nanmax(values):.1f}"]
         for each in theirs:
             low, high = np.nanmin(each[name]), np.nanmax(each[name])
             n_inside = int(((low <= values) & (values <= high)).sum())
             cells += [f"{low:.1f} to {high:.1f}", f"{n_inside} of {np.isfinite(values).sum()}"]
-        print(f"| {name} | {' | '.join(cells)} |")
+        print_row(name, *cells)
 
 
 if __name__ == "__main__":

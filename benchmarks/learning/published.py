@@ -25,10 +25,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from benchmarks.learning.runs import MIXED, finished_run
+from benchmarks.learning.runs import MIXED, chosen_words, finished_run, runs_folder
+from benchmarks.repository import PICTURES
+from benchmarks.tables import print_head, print_row
 
 HERE = Path(__file__).parent
-PICTURE = HERE.parents[1] / "docs" / "images" / "published.png"
 LENGTHS = (10, 5, 2)
 TICKS = (1, 2, 5, 10, 20, 50, 100)
 N_SMOOTHED = 5
@@ -171,17 +172,12 @@ def draw(found: dict[str, dict[str, Curve]], path: Path) -> None:
     figure.savefig(path, dpi=110)
 
 
-def table(found: dict[str, dict[str, Curve]]) -> str:
-    """Return the steps and the time to reach each length, as a Markdown table."""
-    lines = [
-        "| experiment | curve | " + " | ".join(f"length {length}" for length in LENGTHS) + " |",
-        "| --- | --- |" + " --- |" * len(LENGTHS),
-    ]
+def print_table(found: dict[str, dict[str, Curve]]) -> None:
+    """Print the steps and the time to reach each length."""
+    print_head("experiment", "curve", *(f"length {length}" for length in LENGTHS))
     for name, of_name in found.items():
         for label, curve in of_name.items():
-            cells = [_reached(curve.reached(length)) for length in LENGTHS]
-            lines.append(f"| {EXPERIMENTS[name].title} | {label} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+            print_row(EXPERIMENTS[name].title, label, *(_reached(curve.reached(length)) for length in LENGTHS))
 
 
 def _reached(when: tuple[int, float] | None) -> str:
@@ -200,17 +196,13 @@ def _reached(when: tuple[int, float] | None) -> str:
 
 def main(words: list[str]) -> None:
     """Run, draw and print what the words ask for."""
-    given = dict(word.split("=", 1) for word in words if "=" in word)
-    names = [word for word in words if word in EXPERIMENTS] or list(EXPERIMENTS)
-    unknown = [word for word in words if "=" not in word and word not in ("small", "full", *EXPERIMENTS)]
-    if unknown or given.keys() - {"folder", "data"}:
-        sys.exit(f"{' '.join(unknown) or given}: see the text at the head of {__file__}")
-    folder = Path(given.get("folder", "benchmark-runs"))
-    folder.mkdir(parents=True, exist_ok=True)
+    usage = f"see the text at the head of {__file__}"
+    chosen, given = chosen_words(words, ("small", "full", *EXPERIMENTS), {"folder", "data"}, usage)
+    names, folder = [word for word in chosen if word in EXPERIMENTS] or list(EXPERIMENTS), runs_folder(given)
     found = {name: curves(name, is_full="full" in words, volumes=given.get("data"), folder=folder) for name in names}
-    picture = PICTURE if len(names) == len(EXPERIMENTS) else folder / "published.png"
+    picture = (PICTURES if len(names) == len(EXPERIMENTS) else folder) / "published.png"
     draw(found, picture)
-    print(table(found))
+    print_table(found)
     print(f"picture: {picture}")
 
 

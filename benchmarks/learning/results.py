@@ -21,11 +21,22 @@ from pathlib import Path
 
 from filelock import FileLock
 
-from benchmarks.learning.runs import MIXED, Run, finished_run
+from benchmarks.learning.runs import MIXED, Run, chosen_words, finished_run, runs_folder
+from benchmarks.tables import print_head, print_row
 
 FIGURES = Path(__file__).with_name("results.json")
 TEST = "test volumes"
 JUDGED = ["data.n_test=12", "evaluation.episodes=300"]
+# Figure, digits and factor of each column.
+COLUMNS = {
+    "median, mm": ("median_distance_mm", 1, 1),
+    "median, °": ("median_distance_deg", 1, 1),
+    "mean steps": ("mean_steps", 2, 1),
+    "success, %": ("success", 1, 100),
+    "training, s": ("training_s", 0, 1),
+    "mean steps\\*": ("mean_steps_not_started_solved", 2, 1),
+    "success\\*, %": ("success_not_started_solved", 1, 100),
+}
 
 
 @dataclass(frozen=True)
@@ -119,73 +130,53 @@ def measure(name: str, seed: int, data: str, folder: Path) -> None:
         FIGURES.write_text(json.dumps(kept, indent=1, sort_keys=True) + "\n")
 
 
-def table() -> str:
-    """Return two Markdown tables of all kept figures: the figures of each seed, and the goals."""
+def print_tables() -> None:
+    """Print two tables of all kept figures: the figures of each seed, and the goals."""
     kept = json.loads(FIGURES.read_text())
-    lines = [
-        "| | median, mm | median, ° | mean steps | success, % | training, s | mean steps\\* | success\\*, % |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- |",
-    ]
-    goals = ["| | success | mean steps | training | reached by |", "| --- | --- | --- | --- | --- |"]
-    for name, row in ROWS.items():
-        if name in kept:
-            of_seeds = [kept[name][seed] for seed in sorted(kept[name])]
-            cells = [
-                f"{row.title} (`{name}`)",
-                _joined(of_seeds, "median_distance_mm", "{:.1f}"),
-                _joined(of_seeds, "median_distance_deg", "{:.1f}"),
-                _joined(of_seeds, "mean_steps", "{:.2f}"),
-                _joined(of_seeds, "success", "{:.1f}", 100),
-                _joined(of_seeds, "training_s", "{:.0f}"),
-                _joined(of_seeds, "mean_steps_not_started_solved", "{:.2f}"),
-                _joined(of_seeds, "success_not_started_solved", "{:.1f}", 100),
-            ]
-            lines.append("| " + " | ".join(cells) + " |")
-            goals += _goal(name, row, of_seeds)
-    return "\n".join([*lines, "", *goals])
+    found = {name: [kept[name][seed] for seed in sorted(kept[name])] for name in ROWS if name in kept}
+    print_head("", *COLUMNS)
+    for name, of_seeds in found.items():
+        cells = (
+            ", ".join(f"{factor * figures[figure]:.{digits}f}" for figures in of_seeds)
+            for figure, digits, factor in COLUMNS.values()
+        )
+        print_row(f"{ROWS[name].title} (`{name}`)", *cells)
+    print()
+    print_head("", "success", "mean steps", "training", "reached by")
+    for name, of_seeds in found.items():
+        _print_goal(name, ROWS[name], of_seeds)
 
 
-def _joined(of_seeds: list[dict[str, float]], figure: str, form: str, factor: float = 1.0) -> str:
-    return ", ".join(form.format(factor * figures[figure]) for figures in of_seeds)
-
-
-def _goal(name: str, row: Row, of_seeds: list[dict[str, float]]) -> list[str]:
+def _print_goal(name: str, row: Row, of_seeds: list[dict[str, float]]) -> None:
     if row.success is None or row.mean_steps is None or row.minutes is None:
-        return []
+        return
     reached = sum(
         figures["success"] >= row.success
         and figures["mean_steps"] <= row.mean_steps
         and figures["training_s"] <= 60 * row.minutes
         for figures in of_seeds
     )
-    goal = f"≥ {100 * row.success:g} % | ≤ {row.mean_steps:g} | ≤ {row.minutes:g} min"
-    return [f"| `{name}` | {goal} | {reached} of {len(of_seeds)} seeds |"]
+    goal = f"≥ {100 * row.success:g} %", f"≤ {row.mean_steps:g}", f"≤ {row.minutes:g} min"
+    print_row(f"`{name}`", *goal, f"{reached} of {len(of_seeds)} seeds")
 
 
 def main(words: list[str]) -> None:
     """Measure and show what the words ask for."""
-    given = dict(word.split("=", 1) for word in words if "=" in word)
-    names = [word for word in words if "=" not in word and word != "show"]
-    if (unknown := [name for name in names if name not in ROWS]) or given.keys() - {
-        "data",
-        "folder",
-        "seeds",
-        "workers",
-    }:
-        sys.exit(f"{' '.join(unknown) or given}: see the text at the head of {__file__}; rows: {' '.join(ROWS)}")
+    usage = f"see the text at the head of {__file__}"
+    keys = {"data", "folder", "seeds", "workers"}
+    chosen, given = chosen_words(words, (*ROWS, "show"), keys, f"{usage}; rows: {' '.join(ROWS)}")
     if "show" not in words:
         if "data" not in given:
-            sys.exit(f"give data=FOLDER, or show: see the text at the head of {__file__}")
-        folder = Path(given.get("folder", "benchmark-runs"))
-        folder.mkdir(parents=True, exist_ok=True)
+            sys.exit(f"give data=FOLDER, or show: {usage}")
+        folder = runs_folder(given)
         seeds = [int(seed) for seed in given.get("seeds", "0,1,2").split(",")]
         with ThreadPoolExecutor(int(given.get("workers", "2"))) as pool:
             waiting = [
-                pool.submit(measure, name, seed, given["data"], folder) for name in names or ROWS for seed in seeds
+                pool.submit(measure, name, seed, given["data"], folder) for name in chosen or ROWS for seed in seeds
             ]
             for each in waiting:
                 each.result()
-    print(table())
+    print_tables()
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -58,6 +58,25 @@ class Run:
     def n_env_steps(self) -> int:
         """Environment steps of the training."""
         return max((step for step, _ in self.curve["wall_s"]), default=0)
+
+
+def chosen_words(
+    words: Sequence[str], names: Collection[str], keys: Collection[str], usage: str
+) -> tuple[list[str], dict[str, str]]:
+    """Return the names and the `key=value` pairs among the words of a command; exit with a hint if one is unknown."""
+    chosen = [word for word in words if "=" not in word]
+    given = dict(word.split("=", 1) for word in words if "=" in word)
+    unknown = [word for word in chosen if word not in names]
+    if unknown or given.keys() - keys:
+        sys.exit(f"{' '.join(unknown) or given}: {usage}")
+    return chosen, given
+
+
+def runs_folder(given: Mapping[str, str]) -> Path:
+    """Return the folder of runs that a command names, which is created if missing."""
+    folder = Path(given.get("folder", "benchmark-runs"))
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
 
 
 def finished_run(name: str, overrides: Sequence[str], folder: Path) -> Run:

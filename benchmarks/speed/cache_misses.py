@@ -11,7 +11,6 @@ minute each on a quiet machine.
 from __future__ import annotations
 
 import argparse
-import os
 import pickle
 import subprocess
 import sys
@@ -28,6 +27,8 @@ from armscan.anatomy import PIXEL_TISSUES, Scanner
 from armscan.volumes import LabelVolume, load_phantoms
 from armscan.volumes.rigid_transform import mapped_plane
 from armscan.volumes.slicing import sample_plane
+from benchmarks.repository import environment
+from benchmarks.tables import print_head, print_row
 
 BATCH = 16
 PROJECTIONS, PARTS = ("y", "full"), ("lookup", "look")
@@ -49,14 +50,14 @@ def main() -> None:
     if given.planes < BATCH:
         parser.error(f"--planes is {given.planes}, but it must be at least {BATCH}")
     scanner = Scanner(list(load_phantoms(range(4)).values()), PIXEL_TISSUES)
-    print(f"| per plane | {' | '.join(COUNTED)} |\n| --- |{' ---: |' * len(COUNTED)}")
+    print_head("per plane", *COUNTED, align="---:")
     idle = counts(scanner, "look", [])
     for projection in PROJECTIONS:
         batches = draw_batches(scanner.volumes, projection, given.planes // BATCH)
         for part in PARTS:
             counted = counts(scanner, part, batches)
             each = [(counted[name] - idle[name]) / (BATCH * len(batches)) for name in COUNTED]
-            print(f"| {projection}, {part} | {' | '.join(f'{number:,.0f}' for number in each)} |", flush=True)
+            print_row(f"{projection}, {part}", *(f"{number:,.0f}" for number in each))
 
 
 def draw_batches(volumes: Sequence[LabelVolume], projection: str, n_batches: int) -> list[Batch]:
@@ -93,7 +94,7 @@ def counts(scanner: Scanner, part: str, batches: list[Batch]) -> dict[str, int]:
         valgrind = ["valgrind", "-q", "--tool=cachegrind", "--cache-sim=yes", f"--cachegrind-out-file={path}", *CACHES]
         subprocess.run(
             [*valgrind, sys.executable, "-m", "benchmarks.speed.cache_misses", "--serve", part, str(given)],
-            env=os.environ | numba_env | {"NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
+            env=environment(NUMBA_NUM_THREADS="1", **numba_env),
             check=True,
         )
         lines = path.read_text().splitlines()

@@ -1,29 +1,39 @@
-"""Processes that measure on request, each with the code of a checkout.
+"""Processes that run the code of a checkout, and those that measure it on request.
 
 A script that is run with `--serve` reads the name of a case from each line of its input, and answers with a line: what
-it measured, in JSON. With `PYTHONPATH` set to another checkout, the same script measures that checkout's code, so it
-must not import from `benchmarks` at its top.
+it measured, in JSON. `start` runs the same script for any checkout: `armscan` is that checkout's, `benchmarks` ours.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
 import resource
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-HERE = Path(__file__).resolve().parents[2]
+from benchmarks.repository import REPOSITORY, environment
+
+PROGRAM = f"""
+import runpy, sys
+import armscan
+sys.path.insert(0, {str(REPOSITORY)!r})
+sys.argv = sys.argv[1:]
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
 
 
-def parser_of(description: str) -> argparse.ArgumentParser:
-    """Return a parser of the options of a script that serves: the checkout, and the number of rounds."""
+def parser_of(description: str, n_rounds: int | None = None) -> argparse.ArgumentParser:
+    """Return a parser of the option `--before`, an absolute path or None, and of `--rounds` if it has a default."""
     parser = argparse.ArgumentParser(description=description.partition("\n")[0])
-    parser.add_argument("--before", type=Path, metavar="CHECKOUT", help="another checkout to compare with")
-    parser.add_argument("--rounds", type=int, default=15, help="turns of each (default: 15)")
+    what = "another checkout to compare with"
+    parser.add_argument("--before", type=lambda word: Path(word).resolve(), metavar="CHECKOUT", help=what)
+    if n_rounds:
+        parser.add_argument("--rounds", type=int, default=n_rounds, help=f"turns of each (default: {n_rounds})")
     return parser
 
 
@@ -33,11 +43,20 @@ def children_processor_s() -> float:
     return used.ru_utime + used.ru_stime
 
 
+def run_timed(checkout: Path, folder: str | Path, *words: str, **variables: str) -> tuple[str, float, float]:
+    """Run Python in a folder with the code of a checkout; return its output, and its processor and wall seconds."""
+    command, env = [sys.executable, *words], environment(checkout, **variables)
+    before_s, start_s = children_processor_s(), time.perf_counter()
+    done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, check=True)
+    return done.stdout, children_processor_s() - before_s, time.perf_counter() - start_s
+
+
 def start(script: str, checkout: Path) -> subprocess.Popen[str]:
-    """Start a script that serves, with the code of a checkout, on one thread."""
+    """Start a script that serves, with the code of a checkout, on one thread; it ends when its context is left."""
+    # -P: the working folder has another `armscan`.
     return subprocess.Popen(
-        [sys.executable, script, "--serve"],
-        env=os.environ | {"PYTHONPATH": str(checkout.resolve()), "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"},
+        [sys.executable, "-P", "-c", PROGRAM, script, "--serve"],
+        env=environment(checkout, NUMBA_NUM_THREADS="1"),
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
@@ -52,8 +71,9 @@ def ask(process: subprocess.Popen[str], case: str) -> Any:
     return json.loads(process.stdout.readline())
 
 
-def end(process: subprocess.Popen[str]) -> None:
-    """End a process that serves, and wait for it."""
-    assert process.stdin is not None
-    process.stdin.close()
-    process.wait()
+def serve(measure: Callable[[str], Any]) -> None:
+    """Answer each case that is asked for with what it measures."""
+    # What is logged must not look like an answer.
+    answers, sys.stdout = sys.stdout, sys.stderr
+    for line in sys.stdin:
+        print(json.dumps(measure(json.loads(line))), file=answers, flush=True)

@@ -11,25 +11,25 @@ from __future__ import annotations
 
 import os
 
-for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
-    os.environ[_variable] = "1"
+os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 
 import statistics
 import sys
 import time
-from functools import partial
 from typing import Any
 
 import torch
 from tianshou.data import Collector, VectorReplayBuffer
 from tianshou.utils.torch_utils import policy_within_training_step
 
-from armscan.agents import MLP, PPO, SAC, AgentSetup, Compute
+from armscan.agents import MLP, PPO, SAC
 from armscan.agents.step_collector import StepCollector
 from armscan.agents.tianshou_envs import TianshouVectorEnv
 from armscan.envs import EnvFactory
 from armscan.utils.log import silence_libraries
 from armscan.volumes import load_phantoms
+from benchmarks.speed.agent_setup import agent_setup
+from benchmarks.tables import print_head, print_row
 
 N_COLLECTIONS, N_STEPS, TOTAL_STEPS = 50, 16, 100_000
 CASES: dict[str, tuple[Any, dict[str, Any]]] = {
@@ -62,20 +62,12 @@ class TimedEnvs(TianshouVectorEnv):
 
 def collectors(kind: Any, rules: dict[str, Any]) -> list[Collector[Any]]:
     """Return Tianshou's collector and ours, each with environments of its own."""
-    env_factory, volumes = EnvFactory(**rules), load_phantoms(range(4))
-    make_envs = partial(env_factory.make_vector_env, volumes=volumes, autoreset_mode="Disabled")
-    setup = AgentSetup(
-        make_envs=make_envs,
-        observation_space=env_factory.make_env(volumes).observation_space,
-        action_names=make_envs(1).unwrapped.rules.action_names,
-        total_env_steps=TOTAL_STEPS,
-        seed=0,
-        compute=Compute("cpu"),
-    )
+    setup = agent_setup(EnvFactory(**rules), load_phantoms(range(4)), TOTAL_STEPS)
     ours: Any = kind(network=MLP((64, 64))).agent(setup)._collector
-    theirs_envs, our_envs = TimedEnvs(make_envs(ours.env_num)), TimedEnvs(make_envs(ours.env_num))
+    theirs_envs, our_envs = (TimedEnvs(setup.make_envs(ours.env_num)) for _ in range(2))
     theirs = Collector(ours.policy, theirs_envs, VectorReplayBuffer(TOTAL_STEPS, ours.env_num), exploration_noise=True)
-    both = [theirs, StepCollector(ours.policy, our_envs, type(ours.buffer)(TOTAL_STEPS, ours.env_num))]
+    replay = type(ours.buffer)(TOTAL_STEPS, ours.env_num)
+    both = [theirs, StepCollector(ours.policy, our_envs, replay, setup.compute)]
     for each in both:
         each.env.seed(list(range(ours.env_num)))
         each.reset_env()
@@ -97,8 +89,8 @@ def main(words: list[str]) -> None:
     silence_libraries()
     torch.set_num_threads(1)
     n_rounds = int(words[0]) if words else 15
-    print("| 16 steps | environments, ms | Tianshou, ms | ours, ms | ratio | without them: Tianshou | ours | ratio |")
-    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
+    beside = "Tianshou, ms", "ours, ms", "ratio", "without them: Tianshou", "ours", "ratio"
+    print_head("16 steps", "environments, ms", *beside)
     for name, (kind, rules) in CASES.items():
         theirs, ours = collectors(kind, rules)
         for each in (theirs, ours):
@@ -109,11 +101,8 @@ def main(words: list[str]) -> None:
         ratio = statistics.median(theirs / ours for theirs, ours in own)
         theirs_ms, _, ours_ms, envs_ms = (statistics.median(each) for each in zip(*rounds, strict=True))
         their_own, our_own = (statistics.median(each) for each in zip(*own, strict=True))
-        print(
-            f"| {name} | {envs_ms:.2f} | {theirs_ms:.2f} | {ours_ms:.2f} | {whole:.2f} | {their_own:.2f} | "
-            f"{our_own:.2f} | {ratio:.1f} |",
-            flush=True,
-        )
+        figures = (f"{each:.2f}" for each in (envs_ms, theirs_ms, ours_ms, whole, their_own, our_own))
+        print_row(name, *figures, f"{ratio:.1f}")
 
 
 if __name__ == "__main__":

@@ -9,15 +9,17 @@ rounds. A call takes as many compiled steps as `agent=sac` takes after a collect
 
 from __future__ import annotations
 
-import json
 import statistics
 import sys
 import time
 from collections.abc import Callable
-from functools import partial
+from functools import cache
+
+from benchmarks.repository import REPOSITORY
+from benchmarks.speed.checkouts import ask, parser_of, serve, start
+from benchmarks.tables import print_head, print_row
 
 N_RANDOM_STEPS, BATCH_SIZE, N_AT_ONCE, N_TIANSHOU, N_COMPILED = 1_000, 256, 4, 20, 100
-ACTIONS = {"y": ("ty",), "full": ("rz", "rx", "tx", "ty")}
 # Projection, and units of the hidden layers.
 CASES: dict[str, tuple[str, tuple[int, ...]]] = {
     "y, 64-64": ("y", (64, 64)),
@@ -30,73 +32,54 @@ COMPILED, TIANSHOU = "compiled", "Tianshou"
 def main() -> None:
     """Print the table, or take gradient steps for the process that prints it."""
     if sys.argv[1:] == ["--serve"]:
-        serve()
+        serve(step_ms)
         return
-    # Deferred: a process that serves another checkout has that checkout's benchmarks.
-    from benchmarks.speed.checkouts import HERE, ask, end, parser_of, start
-
-    given = parser_of(__doc__).parse_args()
-    theirs, ours = (start(__file__, each) for each in (given.before or HERE, HERE))
-    print("| projection, network | Tianshou, ms | compiled, ms | ratio, median | least | most |")
-    print("| --- | --- | --- | --- | --- | --- |")
-    for case in CASES:
-        # The first turn compiles.
-        rounds = [
-            (ask(theirs, f"{case}, {TIANSHOU}"), ask(ours, f"{case}, {COMPILED}")) for _ in range(1 + given.rounds)
-        ][1:]
-        ratios = [tianshou / compiled for tianshou, compiled in rounds]
-        tianshou, compiled = (statistics.median(each) for each in zip(*rounds, strict=True))
-        print(
-            f"| {case} | {tianshou:.2f} | {compiled:.3f} | {statistics.median(ratios):.1f} | {min(ratios):.1f} "
-            f"| {max(ratios):.1f} |",
-            flush=True,
-        )
-    for process in (theirs, ours):
-        end(process)
+    given = parser_of(__doc__, n_rounds=15).parse_args()
+    print_head("projection, network", "Tianshou, ms", "compiled, ms", "ratio, median", "least", "most")
+    with start(__file__, given.before or REPOSITORY) as theirs, start(__file__, REPOSITORY) as ours:
+        for case in CASES:
+            # The first turn compiles.
+            rounds = [
+                (ask(theirs, f"{case}, {TIANSHOU}"), ask(ours, f"{case}, {COMPILED}")) for _ in range(1 + given.rounds)
+            ][1:]
+            ratios = [tianshou / compiled for tianshou, compiled in rounds]
+            tianshou, compiled = (statistics.median(each) for each in zip(*rounds, strict=True))
+            figures = (f"{each:.1f}" for each in (statistics.median(ratios), min(ratios), max(ratios)))
+            print_row(case, f"{tianshou:.2f}", f"{compiled:.3f}", *figures)
 
 
-def serve() -> None:
-    """Answer each case that is asked for with the milliseconds of processor time of a gradient step."""
-    measures: dict[str, Callable[[], int]] = {}
-    # What is logged must not look like an answer.
-    answers, sys.stdout = sys.stdout, sys.stderr
-    for line in sys.stdin:
-        case = json.loads(line)
-        if case not in measures:
-            measures[case] = measured(*CASES[case.rpartition(", ")[0]], is_compiled=case.endswith(COMPILED))
-        start_s = time.process_time()
-        n_updates = measures[case]()
-        print((time.process_time() - start_s) / n_updates * 1000.0, file=answers, flush=True)
+def step_ms(case: str) -> float:
+    """Return the milliseconds of processor time of a gradient step."""
+    take_steps = steps_of(case)
+    start_s = time.process_time()
+    n_updates = take_steps()
+    return (time.process_time() - start_s) / n_updates * 1000.0
 
 
-def measured(projection: str, hidden_sizes: tuple[int, ...], *, is_compiled: bool) -> Callable[[], int]:
+@cache
+def steps_of(case: str) -> Callable[[], int]:
     """Return a function that takes gradient steps, and returns their number."""
     # From the checkout that this process was started for.
     import torch
     from tianshou.algorithm.modelfree import sac
     from tianshou.utils.torch_utils import policy_within_training_step
 
-    from armscan.agents import MLP, SAC, AgentSetup, Compute
+    from armscan.agents import MLP, SAC
     from armscan.envs import EnvFactory
     from armscan.volumes import load_phantoms
+    from benchmarks.speed.agent_setup import agent_setup
 
     torch.set_num_threads(1)
-    env_factory, volumes = EnvFactory(projection=projection), load_phantoms(range(2))
-    setup = AgentSetup(
-        make_envs=partial(env_factory.make_vector_env, volumes=volumes, autoreset_mode="Disabled"),
-        observation_space=env_factory.make_env(volumes).observation_space,
-        action_names=ACTIONS[projection],
-        total_env_steps=10 * N_RANDOM_STEPS,
-        seed=0,
-        compute=Compute("cpu"),
-    )
+    name, _, way = case.rpartition(", ")
+    projection, hidden_sizes = CASES[name]
+    setup = agent_setup(EnvFactory(projection=projection), load_phantoms(range(2)), 10 * N_RANDOM_STEPS)
     learner = SAC(network=MLP(hidden_sizes), learning_starts=N_RANDOM_STEPS).agent(setup)
     learner.warm_up()
     algorithm, replay = learner._algorithm, learner._replay
 
     def take_steps() -> int:
         with policy_within_training_step(algorithm.policy):
-            if is_compiled:
+            if way == COMPILED:
                 for _ in range(N_COMPILED // N_AT_ONCE):
                     algorithm.update_repeatedly(replay, BATCH_SIZE, N_AT_ONCE)
                 return N_COMPILED

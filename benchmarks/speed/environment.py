@@ -15,14 +15,11 @@ from __future__ import annotations
 
 import os
 
-for _variable in ("OMP_NUM_THREADS", "ITK_GLOBAL_DEFAULT_NUMBER_OF_THREADS"):
-    os.environ[_variable] = "1"
+os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "ITK_GLOBAL_DEFAULT_NUMBER_OF_THREADS"), "1")
 
 import statistics
-import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -33,8 +30,9 @@ import armscan
 from armscan.anatomy import PIXEL_TISSUES, Clusters, TissueClusters, landmark_reward
 from armscan.envs import ManipulatorAction
 from armscan.volumes import LabelVolume, read_dataset
+from benchmarks.repository import given_volumes
+from benchmarks.tables import print_head, print_row
 
-DEFAULT_FOLDER = Path(__file__).parents[2] / "tests" / "data" / "volumes"
 N_ROUNDS, N_STEPS, N_VECTOR_STEPS, N_PLAIN_STEPS = 15, 2000, 60, 2
 NUM_ENVS = 64
 TIMES_AS_LARGE = 8
@@ -124,7 +122,7 @@ def larger(volume: LabelVolume) -> LabelVolume:
 
 def main() -> None:
     """Print the table."""
-    volumes = read_dataset(sys.argv[1] if len(sys.argv) > 1 else DEFAULT_FOLDER)
+    volumes = read_dataset(given_volumes())
     first = next(iter(volumes.values()))
     one, plain = "one environment, one core", "SimpleITK and scikit-learn"
     measures = {
@@ -144,12 +142,12 @@ def main() -> None:
     for measure in measures.values():
         measure()
     rounds = [{name: measure() for name, measure in measures.items()} for _ in range(N_ROUNDS)]
-    print("| | steps/s, median | best | beside one environment |\n| --- | --- | --- | --- |")
+    print_head("", "steps/s, median", "best", "beside one environment")
     for name in measures:
         seconds = [measured[name] for measured in rounds]
         ratio = statistics.median(measured[one] / measured[name] for measured in rounds)
         shown = f"{ratio:.2f}" if ratio > 0.1 else f"1/{1 / ratio:.0f}"
-        print(f"| {name} | {1 / statistics.median(seconds):,.0f} | {1 / min(seconds):,.0f} | {shown} |")
+        print_row(name, f"{1 / statistics.median(seconds):,.0f}", f"{1 / min(seconds):,.0f}", shown)
     print("\nthe plain pipeline gave the same rewards")
 
 

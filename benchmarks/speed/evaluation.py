@@ -13,28 +13,28 @@ from __future__ import annotations
 
 import os
 
-for _variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
-    os.environ[_variable] = "1"
+os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 
 import argparse
-import json
 import statistics
-import sys
 import time
 from collections.abc import Callable
-from functools import partial
-from pathlib import Path
-from typing import TYPE_CHECKING
+from contextlib import nullcontext
+from functools import cache, partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from tianshou.data import Batch
 
 # Only what an earlier checkout has, too; the rest is imported where it is used.
-from armscan.agents import MLP, PPO, SAC, Agent, AgentSetup, Compute, Exhaustive, Learner, OptunaSearch, Random
+from armscan.agents import MLP, PPO, SAC, Agent, Exhaustive, Learner, OptunaSearch, Random
 from armscan.envs import EnvFactory
 from armscan.training import Evaluation, evaluate
 from armscan.volumes import load_phantoms
+from benchmarks.speed.agent_setup import agent_setup
+from benchmarks.speed.checkouts import ask, parser_of, serve, start
+from benchmarks.tables import print_head, print_row
 
 if TYPE_CHECKING:
     from armscan.agents.tianshou_learner import TianshouLearner
@@ -56,24 +56,19 @@ CASES = {
 }
 
 
-def made(env_factory: EnvFactory, algorithm, n_env_steps: int) -> Agent:
-    """Return an agent that has learned for this many environment steps."""
+@cache
+def player(case: str) -> tuple[Agent, Any]:
+    """Return the agent of a case, which has learned for its environment steps, and its environment."""
+    env_factory, algorithm, n_env_steps, _ = CASES[case]
     volumes = load_phantoms(VOLUMES)
-    env = env_factory.make_env(volumes)
-    setup = AgentSetup(
-        make_envs=partial(env_factory.make_vector_env, volumes=volumes, autoreset_mode="Disabled"),
-        observation_space=env.observation_space,
-        action_names=env.get_wrapper_attr("action_names"),
-        total_env_steps=20_000,
-        seed=0,
-        compute=Compute("cpu"),
-    )
-    agent = algorithm.agent(setup)
+    agent, env = algorithm.agent(agent_setup(env_factory, volumes, 20_000)), env_factory.make_env(volumes)
     if n_env_steps:
         assert isinstance(agent, Learner)
         agent.warm_up()
         agent.learn(n_env_steps)
-    return agent
+    # Compiles.
+    evaluate(agent, env, n_episodes=2, seed=0)
+    return agent, env
 
 
 class ThroughTianshou:
@@ -109,21 +104,13 @@ def measured(task) -> tuple[float, Evaluation]:
     return time.process_time() - start_s, evaluation
 
 
-def serve() -> None:
-    """Answer each case that is asked for with the seconds and the mean steps of its evaluation."""
-    torch.set_num_threads(1)
-    players = {}
-    for line in sys.stdin:
-        env_factory, algorithm, n_env_steps, n_episodes = CASES[case := json.loads(line)]
-        if case not in players:
-            players[case] = made(env_factory, algorithm, n_env_steps), env_factory.make_env(load_phantoms(VOLUMES))
-            # Compiles.
-            evaluate(*players[case], n_episodes=2, seed=0)
-        seconds, evaluation = measured(partial(evaluate, *players[case], n_episodes=n_episodes, seed=SEED))
-        print(json.dumps([seconds, evaluation.mean_steps]), flush=True)
+def played(case: str) -> tuple[float, float]:
+    """Return the seconds and the mean steps of the evaluation of a case."""
+    seconds, evaluation = measured(partial(evaluate, *player(case), n_episodes=CASES[case][-1], seed=SEED))
+    return seconds, evaluation.mean_steps
 
 
-def measure(case: str, before: Callable[[str], list[float]] | None) -> str:
+def measure(case: str, before: Callable[[str], list[float]] | None) -> list[str]:
     """Return the row of a case.
 
     Args:
@@ -132,10 +119,7 @@ def measure(case: str, before: Callable[[str], list[float]] | None) -> str:
     """
     from armscan.agents.tianshou_learner import TianshouLearner
 
-    env_factory, algorithm, n_env_steps, n_episodes = CASES[case]
-    agent, env = made(env_factory, algorithm, n_env_steps), env_factory.make_env(load_phantoms(VOLUMES))
-    # Compiles.
-    evaluate(agent, env, n_episodes=2, seed=0)
+    (agent, env), n_episodes = player(case), CASES[case][-1]
     rounds, n_steps = [], float("nan")
     slow = ThroughTianshou(agent) if isinstance(agent, TianshouLearner) else agent
     for _ in range(N_ROUNDS):
@@ -149,36 +133,31 @@ def measure(case: str, before: Callable[[str], list[float]] | None) -> str:
             before_s.append(seconds)
         rounds.append((together_s, alone_s, slow_s, *before_s))
     together_s, alone_s, *others_s = (statistics.median(each) for each in zip(*rounds, strict=True))
-    cells = [f"{together.mean_steps:.1f}", f"{together_s:.2f}", f"{alone_s:.2f}"]
+    cells = [case, f"{together.mean_steps:.1f}", f"{together_s:.2f}", f"{alone_s:.2f}"]
     for place, other_s in enumerate(others_s, start=2):
         cells += [f"{other_s:.2f}", f"{statistics.median(each[place] / each[0] for each in rounds):.1f}"]
-    return " | ".join(("", case, *cells, *([f"{n_steps:.1f}"] if before else []), "")).strip()
+    return [*cells, f"{n_steps:.1f}"] if before else cells
 
 
 def main() -> None:
     """Print the table, or play episodes for the process that prints it."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--before", type=Path, metavar="CHECKOUT", help="Another checkout to measure beside this one.")
+    parser = parser_of(__doc__)
     parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
     parser.add_argument("parts", nargs="*", help="Parts of the names of cases. Default: all cases.")
     given = parser.parse_args()
+    torch.set_num_threads(1)
     if given.serve:
-        serve()
+        serve(played)
         return
     from armscan.utils.log import silence_libraries
-    from benchmarks.speed.checkouts import ask, end, start
 
     silence_libraries()
-    torch.set_num_threads(1)
     columns = ["agent", "mean steps", "side by side, s", "one by one, s", "through Tianshou, s", "ratio"]
-    process = start(__file__, given.before) if given.before else None
-    columns += ["before, s", "ratio", "its mean steps"] if process else []
-    print(f"| {' | '.join(columns)} |\n|{' --- |' * len(columns)}")
-    for case in CASES:
-        if not given.parts or any(part in case for part in given.parts):
-            print(measure(case, partial(ask, process) if process else None), flush=True)
-    if process:
-        end(process)
+    print_head(*columns, *(("before, s", "ratio", "its mean steps") if given.before else ()))
+    with start(__file__, given.before) if given.before else nullcontext() as process:
+        for case in CASES:
+            if not given.parts or any(part in case for part in given.parts):
+                print_row(*measure(case, partial(ask, process) if process else None))
 
 
 if __name__ == "__main__":

@@ -9,18 +9,15 @@ epochs (default: 200 runs, 20 epochs). They are read from a SQLite file and thro
 
 from __future__ import annotations
 
-import argparse
-import os
-import subprocess
-import sys
 import tempfile
-import time
 from pathlib import Path
 
 from mlflow import MlflowClient
 from mlflow.entities import Metric, Param, RunTag
 
-from benchmarks.speed.checkouts import HERE, children_processor_s
+from benchmarks.repository import REPOSITORY
+from benchmarks.speed.checkouts import parser_of, run_timed
+from benchmarks.tables import print_head, print_row
 from tests.support.mlflow_server import mlflow_server
 
 SMALL = (
@@ -39,15 +36,7 @@ AT_ONCE = 1000
 
 def armscan(checkout: Path, folder: Path, *words: str, uri: str) -> tuple[float, float]:
     """Return the processor seconds of a command, and its wall seconds."""
-    before_s, start_s = children_processor_s(), time.perf_counter()
-    subprocess.run(
-        [sys.executable, "-m", "armscan", *words],
-        cwd=folder,
-        env=os.environ | {"PYTHONPATH": str(checkout), "OMP_NUM_THREADS": "1", "MLFLOW_TRACKING_URI": uri},
-        capture_output=True,
-        check=True,
-    )
-    return children_processor_s() - before_s, time.perf_counter() - start_s
+    return run_timed(checkout, folder, "-m", "armscan", *words, MLFLOW_TRACKING_URI=uri)[1:]
 
 
 def copy_run(client: MlflowClient, folder: Path, *, n_runs: int, n_epochs: int) -> None:
@@ -79,25 +68,23 @@ def copy_run(client: MlflowClient, folder: Path, *, n_runs: int, n_epochs: int) 
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--runs", type=int, default=200, help="runs in the store (default: 200)")
     parser.add_argument("--epochs", type=int, default=20, help="epochs of each (default: 20)")
-    parser.add_argument("--before", type=Path, metavar="CHECKOUT", help="another checkout to measure beside this one")
     given = parser.parse_args()
-    checkouts = {**({"before": given.before.resolve()} if given.before else {}), "now": HERE}
+    checkouts = {**({"before": given.before} if given.before else {}), "now": REPOSITORY}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         uri = f"sqlite:///{folder}/mlruns.db"
-        armscan(HERE, folder, "run", *SMALL, uri=uri)
+        armscan(REPOSITORY, folder, "run", *SMALL, uri=uri)
         copy_run(MlflowClient(uri), folder, n_runs=given.runs, n_epochs=given.epochs)
-        print(f"| {given.runs} runs: processor s (wall s) | {' | '.join(checkouts)} |")
-        print(f"| --- |{' ---: |' * len(checkouts)}")
+        print_head(f"{given.runs} runs: processor s (wall s)", *checkouts, align="---:")
         with mlflow_server(folder / "server", uri) as server:
             for store, address in {"SQLite": uri, "a server": server.uri}.items():
                 for command, words in COMMANDS.items():
                     both = (armscan(checkout, folder, *words, uri=address) for checkout in checkouts.values())
                     cells = (f"{processor_s:.1f} ({wall_s:.1f})" for processor_s, wall_s in both)
-                    print(f"| {command}, {store} | {' | '.join(cells)} |", flush=True)
+                    print_row(f"{command}, {store}", *cells)
 
 
 if __name__ == "__main__":

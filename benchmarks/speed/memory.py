@@ -19,6 +19,7 @@ import psutil
 import armscan  # noqa: F401 - registers the environment
 from armscan.envs import make_armscan_env, make_armscan_vector_env
 from armscan.volumes import LabelVolume, ManipulatorAction, load_phantoms, read_dataset
+from benchmarks.tables import print_head, print_row
 
 NUM_ENVS, N_VOLUMES, N_STEPS = 64, 8, 40
 RULES = {"projection": "zy", "transform": None, "success_threshold": 1.0}
@@ -86,17 +87,16 @@ def main() -> None:
         volumes = list(load_phantoms(range(N_VOLUMES)).values())
     n_voxels = sum(volume.labels.size for volume in volumes)
     print(f"{len(volumes)} volumes, {n_voxels / 2**20:.0f} MiB of voxels as uint8; {NUM_ENVS} environments\n")
-    print("| | MiB that the volumes add | times their voxels |\n| --- | --- | --- |")
+    print_head("", "MiB that the volumes add", "times their voxels")
     added = in_child(bytes_when_stepping, volumes)[0] - in_child(bytes_when_stepping, small_volumes())[0]
-    print(f"| one process | {added / 2**20:.0f} | {added / n_voxels:.2f} |\n", flush=True)
-    print("| MiB after steps | 100,000 | 500,000 | 1,000,000 | most | grown since 100,000 | minutes |")
-    print("| --- | --- | --- | --- | --- | --- | --- |")
+    print_row("one process", f"{added / 2**20:.0f}", f"{added / n_voxels:.2f}")
+    print()
+    print_head("MiB after steps", "100,000", "500,000", "1,000,000", "most", "grown since 100,000", "minutes")
     for num_envs in (1, NUM_ENVS):
         *looks, seconds = in_child(bytes_over_steps, volumes, num_envs)
         figures = (looks[0], looks[4], looks[-1], max(looks), looks[-1] - looks[0])
         name = "one environment" if num_envs == 1 else f"{num_envs} environments side by side"
-        shown = " | ".join(f"{figure / 2**20:.1f}" for figure in figures)
-        print(f"| {name} | {shown} | {seconds / 60:.1f} |", flush=True)
+        print_row(name, *(f"{figure / 2**20:.1f}" for figure in figures), f"{seconds / 60:.1f}")
 
 
 if __name__ == "__main__":

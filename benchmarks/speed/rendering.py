@@ -9,20 +9,18 @@ from __future__ import annotations
 
 import os
 
-for _variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
-    os.environ[_variable] = "1"
+os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 
-import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 
 from armscan.envs import ArmscanEnv
 from armscan.volumes import read_dataset
+from benchmarks.repository import given_volumes
+from benchmarks.tables import print_head, print_row
 
-DEFAULT_FOLDER = Path(__file__).parents[2] / "tests" / "data" / "volumes"
 N_FRAMES = 200
 
 
@@ -44,18 +42,16 @@ def median_seconds(env: ArmscanEnv, after_step: Callable[[], object]) -> tuple[f
 
 def main() -> None:
     """Print the table."""
-    env = ArmscanEnv(
-        read_dataset(sys.argv[1] if len(sys.argv) > 1 else DEFAULT_FOLDER), projection="zy", render_mode="rgb_array"
-    )
+    env = ArmscanEnv(read_dataset(given_volumes()), projection="zy", render_mode="rgb_array")
     env.action_space.seed(0)
     for name in env.volumes:
         # Fonts, and the two sides of each volume, are prepared once.
         env.reset(seed=0, options={"volume": name})
         env.render()
     step_s, render_s = median_seconds(env, env.render)
-    print("| | ms | a second |\n| --- | --- | --- |")
+    print_head("", "ms", "a second")
     for name, seconds in (("step", step_s), ("render", render_s), ("step and render", step_s + render_s)):
-        print(f"| {name} | {1e3 * seconds:.2f} | {1 / seconds:.0f} |")
+        print_row(name, f"{1e3 * seconds:.2f}", f"{1 / seconds:.0f}")
     print(f"\nrgb_array: {1 / render_s:.0f} frames/s")
 
 

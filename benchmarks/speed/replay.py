@@ -35,8 +35,9 @@ from armscan.agents.image_replay import replay_for
 from armscan.agents.replay import Replay
 from armscan.envs import EnvFactory, SliceChannelsObservation
 from armscan.volumes import read_dataset
+from benchmarks.repository import given_volumes
+from benchmarks.tables import print_head, print_row
 
-DEFAULT_FOLDER = Path(__file__).parents[2] / "tests" / "data" / "volumes"
 N_ENVS, N_PLAYED, N_PLAIN, N_TRANSITIONS = 16, 10_000, 20_000, 1_000_000
 BATCH_SIZE, N_ROUNDS = 256, 101
 RULES = {"projection": "zy", "rotation_bounds_deg": (90.0, 45.0), "stack": 4, "memory": 4}
@@ -140,25 +141,24 @@ def measure(folder: str | Path, name: str, near: tuple) -> None:
     n_frames = sum(len(images.frames) for images in image._images.values())
     print(f"\n{name}: {N_PLAYED / n_ended:.1f} steps an episode; {n_frames:,} frames of {len(image):,} transitions,")
     print(f"{frame_bytes(image) / n_frames:.0f} bytes each\n")
-    print("| | compact | plain | ratio |\n| --- | --- | --- | --- |")
+    print_head("", "compact", "plain", "ratio")
     of_a_million = 1_000_000 / 2**30
     for what, ours, theirs in (
         ("GiB of 1,000,000 transitions, growth of the process", grown / len(image), plain_bytes / N_PLAIN),
         ("GiB of arrays and frames, counted", counted_bytes(image) / len(image), counted_bytes(plain) / N_PLAIN),
     ):
-        print(f"| {what} | {ours * of_a_million:.2f} | {theirs * of_a_million:.2f} | 1/{theirs / ours:.0f} |")
+        print_row(what, f"{ours * of_a_million:.2f}", f"{theirs * of_a_million:.2f}", f"1/{theirs / ours:.0f}")
     ours, theirs = seconds / len(image) * 1e6, plain_s / N_PLAIN * 1e6
-    print(f"| us to add a transition | {ours:.0f} | {theirs:.0f} | {ours / theirs:.2f} |")
-    for what, (ours, theirs, ratio) in ((f"{N_PLAIN:,} in both", few), (f"{len(image):,} and {N_PLAIN:,}", many)):
-        print(f"| ms of a sampling, {what} | {ours:.2f} | {theirs:.2f} | {ratio:.2f} |", flush=True)
+    print_row("us to add a transition", f"{ours:.0f}", f"{theirs:.0f}", f"{ours / theirs:.2f}")
+    for what, figures in ((f"{N_PLAIN:,} in both", few), (f"{len(image):,} and {N_PLAIN:,}", many)):
+        print_row(f"ms of a sampling, {what}", *(f"{each:.2f}" for each in figures))
 
 
 def main() -> None:
     """Print a table for each kind of episode, each measured in its own process."""
-    folder = sys.argv[1] if len(sys.argv) > 1 else DEFAULT_FOLDER
     context = multiprocessing.get_context("spawn")
     for name, near in (("short episodes", NEAR_SHORT), ("long episodes", NEAR_LONG)):
-        child = context.Process(target=measure, args=(folder, name, near))
+        child = context.Process(target=measure, args=(given_volumes(), name, near))
         child.start()
         child.join()
         if child.exitcode:

@@ -13,12 +13,12 @@ import multiprocessing
 import os
 import sys
 import time
-from functools import partial
 from multiprocessing.synchronize import Barrier
 from pathlib import Path
 from typing import Any
 
 from armscan.volumes import load_phantoms
+from benchmarks.tables import print_head, print_row
 
 N_STEPS = 400
 # Of the slowest worker; if one fails, the others do not wait for ever.
@@ -36,22 +36,15 @@ def work(n_phantoms: int, together: Barrier, answers: Any) -> None:
     # Imported for the memory that it takes in each worker.
     import mlflow  # noqa: F401
 
-    from armscan.agents import MLP, SAC, AgentSetup, Compute
+    from armscan.agents import MLP, SAC
     from armscan.envs import EnvFactory
+    from benchmarks.speed.agent_setup import agent_setup
 
     together.wait()
     start_s, start_cpu_s = time.perf_counter(), time.process_time()
     volumes = load_phantoms(range(n_phantoms))
     seconds, cpu_seconds = time.perf_counter() - start_s, time.process_time() - start_cpu_s
-    env_factory = EnvFactory(projection="y")
-    setup = AgentSetup(
-        make_envs=partial(env_factory.make_vector_env, volumes=volumes, autoreset_mode="Disabled"),
-        observation_space=env_factory.make_env(volumes).observation_space,
-        action_names=("ty",),
-        total_env_steps=20_000,
-        seed=0,
-        compute=Compute("cpu"),
-    )
+    setup = agent_setup(EnvFactory(projection="y"), volumes, 20_000)
     learner = SAC(network=MLP((64, 64)), learning_starts=N_STEPS).agent(setup)
     learner.warm_up()
     learner.learn(N_STEPS)
@@ -75,11 +68,11 @@ def main(words: list[str]) -> None:
         worker.join()
     n_bytes = sum(pss for pss, _, _ in reports)
     allowed = 1.3 * n_voxels + n_workers * 700 * 2**20
-    print("| workers | phantoms | MiB of voxels | PSS of all, MiB | allowed | s until they are there | processor s |")
-    print("| --- | --- | --- | --- | --- | --- | --- |")
+    columns = "MiB of voxels", "PSS of all, MiB", "allowed", "s until they are there", "processor s"
+    print_head("workers", "phantoms", *columns)
     slowest, dearest = max(seconds for _, seconds, _ in reports), max(cpu for _, _, cpu in reports)
-    figures = " | ".join(f"{figure / 2**20:.0f}" for figure in (n_voxels, n_bytes, allowed))
-    print(f"| {n_workers} | {n_phantoms} | {figures} | {slowest:.2f} | {dearest:.2f} |")
+    figures = (f"{figure / 2**20:.0f}" for figure in (n_voxels, n_bytes, allowed))
+    print_row(n_workers, n_phantoms, *figures, f"{slowest:.2f}", f"{dearest:.2f}")
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ continues after the awaited line is killed there.
 
 from __future__ import annotations
 
-import argparse
 import os
 import signal
 import subprocess
@@ -17,11 +16,12 @@ import sys
 import tempfile
 from pathlib import Path
 
-from benchmarks.speed.checkouts import HERE, children_processor_s
+from benchmarks.repository import REPOSITORY, VOLUMES, environment
+from benchmarks.speed.checkouts import children_processor_s, parser_of
+from benchmarks.tables import print_head, print_row
 
 N_PROCESSES = 3
 RUN = "import sys; from armscan.__main__ import main; sys.exit(main())"
-VOLUMES = str(HERE / "tests" / "data" / "volumes")
 STUDY = ("run", "-m", "sweep=sac_y", "study.workers=1")
 UNTIL_IT_TRAINS = (("run",), "training for at most")
 # A command, and the beginning of the line that ends it; None if it ends by itself.
@@ -37,7 +37,7 @@ COMMANDS = {
     "`runs list`": (("runs", "list"), None),
     "`report --runs` of a run that is not there": (("report", "--runs", "abcd"), None),
     "`ui`, without its servers": (("ui", "--mlflow-port", "5998", "--dashboard-port", "5999"), "runs "),
-    "`data inspect`, four volumes": (("data", "inspect", VOLUMES), None),
+    "`data inspect`, four volumes": (("data", "inspect", str(VOLUMES)), None),
     "MLflow alone, its store opened": (None, None),
     "`run`, until it trains": UNTIL_IT_TRAINS,
 }
@@ -58,7 +58,7 @@ def processor_s(checkout: Path, folder: str, words: tuple[str, ...] | None, unti
     with subprocess.Popen(
         [sys.executable, "-c", program, *(words or ())],
         cwd=folder,
-        env=os.environ | {"PYTHONPATH": str(checkout), "OMP_NUM_THREADS": "1"},
+        env=environment(checkout),
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         text=True,
@@ -73,18 +73,16 @@ def processor_s(checkout: Path, folder: str, words: tuple[str, ...] | None, unti
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--before", type=Path, metavar="CHECKOUT", help="Another checkout to measure beside this one.")
-    other = parser.parse_args().before
-    checkouts = {**({"before": other.resolve()} if other else {}), "now": HERE}
-    print(f"| processor seconds | {' | '.join(checkouts)} |\n| --- |{' ---: |' * len(checkouts)}")
+    other = parser_of(__doc__).parse_args().before
+    checkouts = {**({"before": other} if other else {}), "now": REPOSITORY}
+    print_head("processor seconds", *checkouts, align="---:")
     with tempfile.TemporaryDirectory() as folder:
         for checkout in checkouts.values():
             processor_s(checkout, folder, *UNTIL_IT_TRAINS)
         for name, command in COMMANDS.items():
             rounds = [[processor_s(each, folder, *command) for each in checkouts.values()] for _ in range(N_PROCESSES)]
             least = (min(column) for column in zip(*rounds, strict=True))
-            print(f"| {name} | {' | '.join(f'{seconds:.1f}' for seconds in least)} |", flush=True)
+            print_row(name, *(f"{seconds:.1f}" for seconds in least))
 
 
 if __name__ == "__main__":

@@ -10,6 +10,8 @@ from __future__ import annotations
 import subprocess
 import sys
 
+from benchmarks.tables import print_head, print_row
+
 N_PROCESSES = 5
 IMPORT = "import time; start = time.perf_counter(); import armscan; print(time.perf_counter() - start)"
 STEP = """
@@ -40,10 +42,10 @@ def seconds(program: str) -> float:
 
 def main() -> None:
     """Print the table."""
-    print("| | seconds |\n| --- | --- |")
+    print_head("", "seconds")
     for name, program in PROGRAMS.items():
         seconds(program)
-        print(f"| {name} | {min(seconds(program) for _ in range(N_PROCESSES)):.2f} |")
+        print_row(name, f"{min(seconds(program) for _ in range(N_PROCESSES)):.2f}")
 
 
 if __name__ == "__main__":

@@ -9,12 +9,16 @@ processor time over the rounds.
 
 from __future__ import annotations
 
-import json
 import statistics
 import sys
 import time
 from collections.abc import Callable
+from functools import cache
 from typing import Any
+
+from benchmarks.repository import REPOSITORY
+from benchmarks.speed.checkouts import ask, parser_of, serve, start
+from benchmarks.tables import print_head, print_row
 
 N_STEPS = 2000
 CASES: dict[str, tuple[int, dict[str, Any]]] = {
@@ -32,52 +36,43 @@ CASES: dict[str, tuple[int, dict[str, Any]]] = {
 def main() -> None:
     """Print the table, or take steps for the process that prints it."""
     if sys.argv[1:] == ["--serve"]:
-        serve()
+        serve(step_s)
         return
-    # Deferred: a process that serves another checkout has that checkout's benchmarks.
-    from benchmarks.speed.checkouts import HERE, ask, end, parser_of, start
-
-    parser = parser_of(__doc__)
+    parser = parser_of(__doc__, n_rounds=15)
     given = parser.parse_args()
     if given.before is None:
         parser.error("--before is not given: name the checkout to compare with")
-    processes = [start(__file__, each) for each in (HERE, given.before)]
+    with start(__file__, REPOSITORY) as ours, start(__file__, given.before) as theirs:
+        processes = ours, theirs
+        for case in CASES:
+            for process in processes:
+                ask(process, case)
+        print_head("", "us a step", "before", "ratio", "least", "most")
+        rounds = [{case: [ask(each, case) for each in processes] for case in CASES} for _ in range(given.rounds)]
     for case in CASES:
-        for process in processes:
-            ask(process, case)
-    print("| | us a step | before | ratio | least | most |\n| --- | --- | --- | --- | --- | --- |")
-    rounds = [{case: [ask(each, case) for each in processes] for case in CASES} for _ in range(given.rounds)]
-    for case in CASES:
-        medians = [statistics.median(each[case][which] for each in rounds) for which in range(len(processes))]
-        ratios = sorted(each[case][-1] / each[case][0] for each in rounds)
-        print(
-            f"| {case} | {' | '.join(f'{1e6 * each:.0f}' for each in medians)} | {statistics.median(ratios):.2f} "
-            f"| {ratios[0]:.2f} | {ratios[-1]:.2f} |"
-        )
-    for process in processes:
-        end(process)
+        medians = (statistics.median(each) for each in zip(*(each[case] for each in rounds), strict=True))
+        ratios = [before / now for now, before in (each[case] for each in rounds)]
+        figures = (f"{each:.2f}" for each in (statistics.median(ratios), min(ratios), max(ratios)))
+        print_row(case, *(f"{1e6 * each:.0f}" for each in medians), *figures)
 
 
-def serve() -> None:
-    """Answer each case that is asked for with the seconds of processor time of a step."""
-    measures: dict[str, Callable[[], None]] = {}
-    for line in sys.stdin:
-        case = json.loads(line)
-        if case not in measures:
-            measures[case] = measured(*CASES[case])
-            measures[case]()
-        start_s = time.process_time()
-        measures[case]()
-        print((time.process_time() - start_s) / N_STEPS, flush=True)
+def step_s(case: str) -> float:
+    """Return the seconds of processor time of a step."""
+    take_steps = steps_of(case)
+    start_s = time.process_time()
+    take_steps()
+    return (time.process_time() - start_s) / N_STEPS
 
 
-def measured(num_envs: int, rules: dict[str, Any]) -> Callable[[], None]:
-    """Return a function that takes the steps."""
+@cache
+def steps_of(case: str) -> Callable[[], None]:
+    """Return a function that takes the steps of a case, and has taken them once."""
     # From the checkout that this process was started for.
     import gymnasium as gym
 
     import armscan
 
+    num_envs, rules = CASES[case]
     if num_envs > 1:
         envs: Any = gym.make_vec(armscan.ENV_ID, num_envs=num_envs, **rules)
     else:
@@ -92,6 +87,7 @@ def measured(num_envs: int, rules: dict[str, Any]) -> Callable[[], None]:
             if num_envs == 1 and (terminated or truncated):
                 envs.reset()
 
+    take_steps()
     return take_steps
 
 

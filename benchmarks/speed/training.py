@@ -10,17 +10,14 @@ rounds. Cases: `default` (20,000 steps, never stopped early), `make_run` (the de
 
 from __future__ import annotations
 
-import argparse
-import os
 import statistics
-import subprocess
-import sys
 import tempfile
-import time
 from pathlib import Path
 from typing import NamedTuple
 
-from benchmarks.speed.checkouts import HERE, children_processor_s
+from benchmarks.repository import REPOSITORY
+from benchmarks.speed.checkouts import parser_of, run_timed
+from benchmarks.tables import print_head, print_row
 
 CASES = {"default": ["training.solved=null"], "make_run": [], "best_full": ["experiment=best_full"]}
 DEFAULT_CASES = ("default", "make_run")
@@ -53,19 +50,8 @@ class Run(NamedTuple):
 
 def run(checkout: Path, *words: str) -> Run:
     """Run the command with the code of a checkout, and measure it."""
-    before_s, start_s = children_processor_s(), time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
-        said = subprocess.run(
-            [sys.executable, "-c", PROGRAM, *words],
-            cwd=folder,
-            env=os.environ | {"PYTHONPATH": str(checkout), "OMP_NUM_THREADS": "1"},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            text=True,
-            check=True,
-        ).stdout
-        wall_s = time.perf_counter() - start_s
-    processor_s = children_processor_s() - before_s
+        said, processor_s, wall_s = run_timed(checkout, folder, "-c", PROGRAM, *words)
     (line,) = (line for line in said.splitlines() if line.startswith("trained "))
     _, seconds, n_steps = line.split()
     return Run(float(seconds), processor_s, wall_s, int(n_steps))
@@ -73,19 +59,16 @@ def run(checkout: Path, *words: str) -> Run:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--before", type=Path, help="another checkout to compare with")
-    parser.add_argument("--rounds", type=int, default=3, help="runs of each (default: 3)")
+    parser = parser_of(__doc__, n_rounds=3)
     parser.add_argument("cases", nargs="*", metavar="CASE", help=f"{', '.join(CASES)} (default: the first two)")
     given = parser.parse_args()
     if unknown := set(given.cases) - set(CASES):
         parser.error(f"unknown cases: {', '.join(sorted(unknown))}")
-    checkouts = [each.resolve() for each in (HERE, given.before) if each]
+    checkouts = [each for each in (REPOSITORY, given.before) if each]
     for checkout in checkouts:
         run(checkout, *SHORT)
     beside = ["before", "ratio: median, least, most"] if given.before else []
-    header = ["run", "steps", *(cell for title in COLUMNS for cell in (title, *beside))]
-    print(f"| {' | '.join(header)} |\n|{' --- |' * len(header)}", flush=True)
+    print_head("run", "steps", *(cell for title in COLUMNS for cell in (title, *beside)))
     for case in given.cases or DEFAULT_CASES:
         rounds = [[run(checkout, *CASES[case]) for checkout in checkouts] for _ in range(given.rounds)]
         cells = [case, " and ".join(f"{each.n_env_steps:,}" for each in rounds[0])]
@@ -95,7 +78,7 @@ def main() -> None:
             if given.before:
                 ratios = [before / now for now, before in seconds]
                 cells.append(f"{statistics.median(ratios):.2f}, {min(ratios):.2f}, {max(ratios):.2f}")
-        print(f"| {' | '.join(cells)} |", flush=True)
+        print_row(*cells)
 
 
 if __name__ == "__main__":

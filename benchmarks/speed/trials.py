@@ -9,14 +9,14 @@ the study's seed, so that both checkouts have the same ones.
 
 from __future__ import annotations
 
-import argparse
-import os
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
-from benchmarks.speed.checkouts import HERE
+from benchmarks.repository import REPOSITORY, environment
+from benchmarks.speed.checkouts import parser_of
+from benchmarks.tables import print_head, print_row
 
 # Python imports this `sitecustomize` at the start of each process; in the worker's, it times the trials.
 SITE = """
@@ -62,8 +62,7 @@ def trial_seconds(checkout: Path, n_trials: int) -> list[float]:
         subprocess.run(
             [sys.executable, "-m", "armscan.run", *WORDS, f"study.n_trials={n_trials}"],
             cwd=folder,
-            env=os.environ
-            | {"PYTHONPATH": f"{folder}:{checkout}", "OMP_NUM_THREADS": "1", "SECONDS_FILE": str(seconds)},
+            env=environment(f"{folder}:{checkout}", SECONDS_FILE=str(seconds)),
             stdout=subprocess.DEVNULL,
             check=True,
         )
@@ -72,19 +71,17 @@ def trial_seconds(checkout: Path, n_trials: int) -> list[float]:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--before", type=Path, help="another checkout to compare with")
+    parser = parser_of(__doc__)
     parser.add_argument("--trials", type=int, default=4, help="trials of each (default: 4)")
     given = parser.parse_args()
     if given.trials < 2:
         parser.error(f"--trials is {given.trials}: the first is not warm, so it must be 2 or more")
-    seconds = [trial_seconds(each.resolve(), given.trials) for each in (HERE, given.before) if each]
-    columns = ["trial", "processor s", *(["before", "ratio"] if given.before else [])]
-    print(f"| {' | '.join(columns)} |\n|{' --- |' * len(columns)}")
+    seconds = [trial_seconds(each, given.trials) for each in (REPOSITORY, given.before) if each]
+    print_head("trial", "processor s", *(("before", "ratio") if given.before else ()))
     for number, (now, *before) in enumerate(zip(*seconds, strict=True)):
         first = " (the first)" if number == 0 else ""
-        cells = [f"{number}{first}", f"{now:.1f}", *(f"{each:.1f} | {each / now:.1f}" for each in before)]
-        print(f"| {' | '.join(cells)} |")
+        beside = (f"{figure:.1f}" for each in before for figure in (each, each / now))
+        print_row(f"{number}{first}", f"{now:.1f}", *beside)
     warm = [sum(each[1:]) / (given.trials - 1) for each in seconds]
     print(f"\nwarm, mean: {' and before '.join(f'{each:.1f} s' for each in warm)}")
     print(f"two quiet cores would finish {2 * 3600 / warm[0]:.0f} an hour")

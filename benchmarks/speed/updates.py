@@ -11,21 +11,21 @@ from __future__ import annotations
 
 import os
 
-for _variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
-    os.environ[_variable] = "1"
+os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 
 import statistics
 import sys
 import time
-from functools import partial
 
 import torch
 from tianshou.utils.torch_utils import policy_within_training_step
 
-from armscan.agents import MLP, SAC, AgentSetup, Compute, Multimodal, Network
+from armscan.agents import MLP, SAC, Compute, Multimodal, Network
 from armscan.envs import EnvFactory, SliceChannelsObservation
 from armscan.utils.log import silence_libraries
 from armscan.volumes import load_phantoms
+from benchmarks.speed.agent_setup import agent_setup
+from benchmarks.tables import print_head, print_row
 
 N_ROUNDS, N_RANDOM_STEPS, ROUND_S = 5, 1_000, 3.0
 CASES: dict[str, tuple[EnvFactory, Network]] = {
@@ -54,15 +54,7 @@ def ways() -> dict[str, Compute]:
 
 def updater(env_factory: EnvFactory, network: Network, compute: Compute):
     """Return a function that measures updates per second, with a filled replay buffer."""
-    volumes = load_phantoms(range(2))
-    setup = AgentSetup(
-        make_envs=partial(env_factory.make_vector_env, volumes=volumes, autoreset_mode="Disabled"),
-        observation_space=env_factory.make_env(volumes).observation_space,
-        action_names=("rz", "rx", "tx", "ty"),
-        total_env_steps=10 * N_RANDOM_STEPS,
-        seed=0,
-        compute=compute,
-    )
+    setup = agent_setup(env_factory, load_phantoms(range(2)), 10 * N_RANDOM_STEPS, compute)
     learner = SAC(network=network, learning_starts=N_RANDOM_STEPS).agent(setup)
     learner.warm_up()
     algorithm, replay = learner._algorithm, learner._replay
@@ -85,8 +77,7 @@ def main(words: list[str]) -> None:
     silence_libraries()
     torch.set_num_threads(1)
     chosen = {name: case for name, case in CASES.items() if not words or any(word in name for word in words)}
-    print("| observation, network | computed | updates/s, median | best | beside the first |")
-    print("| --- | --- | --- | --- | --- |")
+    print_head("observation, network", "computed", "updates/s, median", "best", "beside the first")
     for name, (env_factory, network) in chosen.items():
         measures = {way: updater(env_factory, network, compute) for way, compute in ways().items()}
         for measure in measures.values():
@@ -97,9 +88,7 @@ def main(words: list[str]) -> None:
         for way in measures:
             figures = [each[way] for each in rounds]
             ratio = statistics.median(each[way] / each[first] for each in rounds)
-            print(
-                f"| {name} | {way} | {statistics.median(figures):.1f} | {max(figures):.1f} | {ratio:.2f} |", flush=True
-            )
+            print_row(name, way, f"{statistics.median(figures):.1f}", f"{max(figures):.1f}", f"{ratio:.2f}")
 
 
 if __name__ == "__main__":

@@ -24,17 +24,14 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import sys
-import tempfile
 from collections.abc import Callable
-from pathlib import Path
-
-import yaml
 
 from benchmarks.sweeps.compare_sweepers import compare
 from benchmarks.sweeps.kill_workers import kill
 from benchmarks.sweeps.occupancy import idle
 from benchmarks.sweeps.overhead import beside
 from benchmarks.sweeps.same_budget import same_budget
+from benchmarks.sweeps.studies import call
 
 MEASURES: dict[str, Callable[..., None]] = {
     "compare": compare,
@@ -47,13 +44,10 @@ MEASURES: dict[str, Callable[..., None]] = {
 
 def main(words: list[str]) -> None:
     """Run the benchmark that the words name."""
-    given = dict(word.split("=", 1) for word in words if "=" in word)
     what = [word for word in words if "=" not in word]
     if len(what) != 1 or what[0] not in MEASURES:
         sys.exit(__doc__)
-    folder = Path(given.pop("folder", "") or tempfile.mkdtemp()).absolute()
-    folder.mkdir(parents=True, exist_ok=True)
-    MEASURES[what[0]](folder, **{name: yaml.safe_load(text) for name, text in given.items()})
+    call(MEASURES[what[0]], [word for word in words if "=" in word])
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import subprocess
 import time
 import venv
@@ -21,9 +20,11 @@ import optuna
 from optuna.trial import TrialState
 
 from armscan.utils.files import cache_folder
+from benchmarks.repository import environment
 from benchmarks.sweeps.occupancy import Occupation, share_in_trials, slept
-from benchmarks.sweeps.studies import N_WORKERS, REPOSITORY
+from benchmarks.sweeps.studies import N_WORKERS
 from benchmarks.sweeps.wait import WAITED_FILE, Waited
+from benchmarks.tables import print_head, print_row
 
 HYDRA_OPTUNA = Path(__file__).parent / "hydra_optuna"
 
@@ -63,9 +64,9 @@ def compare(folder: Path, *, trials: int = 60, shortest_s: float = 6.0, longest_
         ],
         "the same, from a trial's claim to its tell": [f"{share_in_trials(state):.1%}", ""],
     }
-    print("| | armscan | Hydra's Optuna sweeper |\n| --- | --- | --- |")
+    print_head("", "armscan", "Hydra's Optuna sweeper")
     for name, cells in rows.items():
-        print(f"| {name} | {' | '.join(cells)} |")
+        print_row(name, *cells)
 
 
 def hydra_python() -> Path:
@@ -89,11 +90,10 @@ def _by_hydra(python: Path, folder: Path, trials: int, shortest_s: float, longes
         *(f"hydra.sweep.dir={sweep}", f"hydra.sweeper.storage=sqlite:///{database}"),
         f"hydra.sweeper.n_trials={trials}",
     )
-    variables = os.environ | {"PYTHONPATH": str(REPOSITORY), "OMP_NUM_THREADS": "1"}
     start_s = time.monotonic()
     with (folder / "hydra_optuna.log").open("w") as log:
         command = [python, HYDRA_OPTUNA / "app.py", *words]
-        subprocess.run(command, cwd=folder, env=variables, stdout=log, stderr=log, check=True)
+        subprocess.run(command, cwd=folder, env=environment(), stdout=log, stderr=log, check=True)
     command_s = time.monotonic() - start_s
     of_worker: dict[str, list[Waited]] = {}
     for file in sweep.glob(f"*/{WAITED_FILE}"):

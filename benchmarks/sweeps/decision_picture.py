@@ -7,8 +7,6 @@ The scores are simulated; the race and the interval of the difference are armsca
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
@@ -18,8 +16,8 @@ from armscan.reports.chart_style import BLUE, GREY, ORANGE
 from armscan.stats.aggregation import probability_of_improvement
 from armscan.stats.paired import paired_difference
 from armscan.sweeps.scheduling.race import MAX_SEEDS_FACTOR, Race, race
+from benchmarks.repository import PICTURES
 
-PICTURE = Path(__file__).parents[2] / "docs" / "images" / "how_a_study_decides.svg"
 N_TRIALS, N_VALIDATION, N_TEST, N_JUDGING = 30, 8, 12, 5
 MIN_SEEDS, MEAN_SEEDS = 2, 6
 MAX_SEEDS = MAX_SEEDS_FACTOR * MEAN_SEEDS
@@ -60,7 +58,7 @@ def main() -> None:
     for each in axes:
         each.spines[["top", "right"]].set_visible(False)
     figure.tight_layout(w_pad=2.5)
-    figure.savefig(PICTURE, metadata={"Date": None})
+    figure.savefig(PICTURES / "how_a_study_decides.svg", metadata={"Date": None})
 
 
 def draw_search(axes: Axes, seen: np.ndarray, steps: dict[int, float]) -> None:

@@ -25,6 +25,7 @@ from armscan.stats.aggregation import probability_of_improvement
 from armscan.stats.bootstrap import LEVEL, N_RESAMPLES
 from armscan.stats.paired import crossed_mean
 from armscan.sweeps.scheduling.race import MAX_SEEDS_FACTOR, race
+from benchmarks.tables import print_head, print_row
 
 N_CANDIDATES, N_VALIDATION, MIN_SEEDS, MEAN_SEEDS = 4, 8, 2, 6
 MAX_SEEDS = MAX_SEEDS_FACTOR * MEAN_SEEDS
@@ -104,14 +105,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--studies", type=int, default=2000)
     n_studies = parser.parse_args().studies
-    names = "paired | bootstrap | improvement | studies | trainings to select"
-    print(f"| seeds | test volumes | effect | {names} |")
-    print("| --- " * 8 + "|")
+    names = "paired", "bootstrap", "improvement", "studies", "trainings to select"
+    print_head("seeds", "test volumes", "effect", *names)
     for n_seeds, n_volumes, effect in product(N_SEEDS, N_VOLUMES, EFFECTS):
         found = simulate(n_studies, n_seeds, n_volumes, effect)
-        shares = " | ".join(f"{share:.1%}" for share in found[:3])
-        line = f"| {n_seeds} | {n_volumes} | {effect} | {shares} | {found.n_studies} | {found.n_trainings:.1f} |"
-        print(line, flush=True)
+        shares = (f"{share:.1%}" for share in found[:3])
+        print_row(n_seeds, n_volumes, effect, *shares, found.n_studies, f"{found.n_trainings:.1f}")
 
 
 if __name__ == "__main__":

@@ -25,6 +25,7 @@ from armscan.sweeps.storage.attribute_names import METRICS
 from armscan.sweeps.tasks.attempt import Attempt
 from armscan.sweeps.tasks.training import TrainingTask
 from benchmarks.sweeps.studies import by_worker, finish
+from benchmarks.tables import print_head, print_row
 
 OF_STUDY = ("config", "opened", "report", "keep_seed", "show_picture")
 N_WORKERS = 2
@@ -121,6 +122,7 @@ def beside(folder: Path, *, trials: int = 10) -> None:
             100 * own_s / each.trial_s for own_s, each in zip(study_s, shares, strict=True)
         ],
     }
-    print(f"{len(shares)} trials by {len(workers)} workers\n\n| s | median | most |\n| --- | --- | --- |")
+    print(f"{len(shares)} trials by {len(workers)} workers\n")
+    print_head("s", "median", "most")
     for name, seconds in rows.items():
-        print(f"| {name} | {statistics.median(seconds):.2f} | {max(seconds):.2f} |")
+        print_row(name, f"{statistics.median(seconds):.2f}", f"{max(seconds):.2f}")

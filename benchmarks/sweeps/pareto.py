@@ -13,7 +13,6 @@ order. A replayed trial is the same training until it is pruned, so that only th
 from __future__ import annotations
 
 import sys
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate
@@ -31,7 +30,7 @@ from armscan.sweeps.storage.attribute_names import ENV_STEPS
 from armscan.sweeps.storage.reports import REPORT, reports_of, store_report
 from armscan.sweeps.study.pruners import ParetoPruner
 from benchmarks.sweeps.bench.table import VALIDATION, read_rows, table_file
-from benchmarks.sweeps.studies import run_study
+from benchmarks.sweeps.studies import call, run_study
 
 WORDS = ("projection=y", "training.env_steps=8000", "training.eval_every_env_steps=1000")
 DIRECTIONS = (StudyDirection.MAXIMIZE, StudyDirection.MINIMIZE)
@@ -130,14 +129,12 @@ def compare(unpruned: Unpruned, n_replays: int) -> None:
     )
 
 
-def main(words: list[str]) -> None:
+def main(folder: Path, *, trials: int = 60, replays: int = 200) -> None:
     """Measure both studies."""
-    given = dict(word.split("=", 1) for word in words)
-    folder = Path(given.get("folder") or tempfile.mkdtemp()).absolute()
     optuna.logging.set_verbosity(optuna.logging.ERROR)
-    for unpruned in (sac_y(), speed_vs_success(folder, int(given.get("trials", "60")))):
-        compare(unpruned, int(given.get("replays", "200")))
+    for unpruned in (sac_y(), speed_vs_success(folder, trials)):
+        compare(unpruned, replays)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    call(main, sys.argv[1:])

@@ -9,13 +9,12 @@ and only the pruning differs. Studies already in the folder are resumed.
 from __future__ import annotations
 
 import sys
-import tempfile
 from pathlib import Path
 
 from optuna.trial import FrozenTrial, TrialState
 
 from armscan.sweeps.scheduling.state import StudyState, env_steps_of
-from benchmarks.sweeps.studies import run_study
+from benchmarks.sweeps.studies import call, run_study
 
 STUDIES = {"plain": ["study/pruner=none"], "pruned": []}
 
@@ -57,13 +56,11 @@ def compare(folder: Path, seed: int, n_trials: int) -> None:
     )
 
 
-def main(words: list[str]) -> None:
-    """Compare the studies of each seed."""
-    given = dict(word.split("=", 1) for word in words)
-    folder = Path(given.get("folder") or tempfile.mkdtemp())
-    for seed in map(int, given.get("seeds", "0,1,2").split(",")):
-        compare(folder / f"seed_{seed}", seed, int(given.get("trials", "40")))
+def main(folder: Path, *, seeds: str | int = "0,1,2", trials: int = 40) -> None:
+    """Compare the studies of each seed; a single seed is a number."""
+    for seed in map(int, str(seeds).split(",")):
+        compare(folder / f"seed_{seed}", seed, trials)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    call(main, sys.argv[1:])

@@ -36,6 +36,7 @@ from armscan.sweeps.workers.heartbeat import Heartbeat
 from armscan.sweeps.workers.worker import Worker
 from armscan.tracking import open_store
 from armscan.utils.retry import RetryPolicy
+from benchmarks.tables import print_head, print_row
 from tests.support.mlflow_server import mlflow_server
 from tests.support.postgres import PostgresServer, postgres_server
 
@@ -194,12 +195,12 @@ def measured(server: PostgresServer, n_workers: int, tracking_uri: str | None, f
     return took.total_seconds(), n_trials, uri
 
 
-def row(took_s: float, n_trials: int, of_storage: Asked, of_mlflow: Asked | None) -> str:
+def row(took_s: float, n_trials: int, of_storage: Asked, of_mlflow: Asked | None) -> list[str]:
     """Return the cells of a study in the table."""
     figures = [f"{60 * n_trials / took_s:.0f}", f"{of_storage.commits / n_trials:.1f}"]
     for each in (of_storage, of_mlflow):
         figures += [f"{each.statements / n_trials:.0f}", f"{each.busy_s / took_s:.1%}"] if each else ["-", "-"]
-    return " | ".join(figures)
+    return figures
 
 
 def main() -> None:
@@ -212,14 +213,14 @@ def main() -> None:
         server.execute("CREATE EXTENSION pg_stat_statements")
         backend = server.make_database()
         tracking = mlflow_server(Path(name), backend) if given.tracking else nullcontext()
-        print("| workers | trials/min | transactions | statements | busy | MLflow: statements | busy |")
-        print("| --- | --- | --- | --- | --- | --- | --- |")
+        of_storage = "transactions", "statements", "busy"
+        print_head("workers", "trials/min", *of_storage, "MLflow: statements", "busy")
         with tracking as mlflow:
             for n_workers in given.workers:
                 tracking_uri = mlflow.uri if mlflow else None
                 took_s, n_trials, uri = measured(server, n_workers, tracking_uri, Path(name) / str(n_workers))
                 of_mlflow = asked(server, backend) if mlflow else None
-                print(f"| {n_workers} | {row(took_s, n_trials, asked(server, uri), of_mlflow)} |", flush=True)
+                print_row(n_workers, *row(took_s, n_trials, asked(server, uri), of_mlflow))
 
 
 if __name__ == "__main__":

@@ -22,9 +22,9 @@ from armscan.sweeps.storage.storage import existing_storage
 from armscan.tracking.store import open_existing_store
 from armscan.ui.runs_page import runs_page
 from armscan.ui.servers import HOST, mlflow_server, start_dashboard
+from benchmarks.repository import PICTURES
 from tests.support.browser import chromium
 
-PICTURES = Path(__file__).parents[2] / "docs" / "images"
 STUDY = (
     *("-m", "sweep=sac_y", "study.n_trials=24", "training.env_steps=6000", "study.workers=1"),
     *("study.final_eval.top_k=1", "study.final_eval.mean_seeds=2", "study.final_eval.judge_seeds=3"),

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
+import tempfile
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import optuna
+import yaml
 from optuna.trial import FrozenTrial
 
 from armscan.sweeps.scheduling.state import StudyState
 from armscan.sweeps.storage.attribute_names import LEASE
 from armscan.sweeps.storage.storage import open_storage
+from benchmarks.repository import environment
 
 N_WORKERS = 4
 NAME, JOURNAL = "benchmark", "optuna.journal"
-REPOSITORY = Path(__file__).parents[2]
 # Overrides of every study here.
 WITHOUT_FINAL_EVAL = ("study.final_eval.top_k=0",)
 SLEEPING = (
@@ -32,14 +34,30 @@ sys.exit(main())
 """
 
 
-def started(folder: Path, *words: str) -> subprocess.Popen[bytes]:
-    """Start a study in a folder, without final evaluation."""
-    environment = os.environ | {"PYTHONPATH": str(REPOSITORY), "OMP_NUM_THREADS": "1"}
-    words = ("-m", "sweep=sac_y", f"study.name={NAME}", *WITHOUT_FINAL_EVAL, *words)
-    with (folder / "printed").open("ab") as printed:
-        return subprocess.Popen(
-            [sys.executable, "-c", PROGRAM, *words], cwd=folder, env=environment, stdout=printed, stderr=printed
-        )
+def call(measure: Callable[..., None], words: Sequence[str]) -> None:
+    """Call a function with the values of the words `folder=FOLDER` and `key=value`; default: a temporary folder."""
+    given = dict(word.split("=", 1) for word in words)
+    folder = Path(given.pop("folder", "") or tempfile.mkdtemp()).absolute()
+    folder.mkdir(parents=True, exist_ok=True)
+    measure(folder, **{name: yaml.safe_load(text) for name, text in given.items()})
+
+
+def started(
+    folder: Path, *words: str, sweep: str = "sac_y", name: str = NAME, python: Sequence[str] = ("-c", PROGRAM)
+) -> subprocess.Popen[bytes]:
+    """Start a study in a folder, without final evaluation.
+
+    Args:
+        folder: Folder of the study; what it prints goes to `NAME.log` there.
+        *words: Further overrides.
+        sweep: Name of the sweep. Default: `sac_y`.
+        name: Name of the study. Default: `benchmark`.
+        python: Python's words for the command. Default: those of `PROGRAM`.
+    """
+    words = ("-m", f"sweep={sweep}", f"study.name={name}", *WITHOUT_FINAL_EVAL, *words)
+    with (folder / f"{name}.log").open("ab") as log:
+        command = [sys.executable, *python, *words]
+        return subprocess.Popen(command, cwd=folder, env=environment(), stdout=log, stderr=log)
 
 
 def run_study(folder: Path, sweep: str, name: str, *words: str) -> optuna.Study:
@@ -52,32 +70,19 @@ def run_study(folder: Path, sweep: str, name: str, *words: str) -> optuna.Study:
         *words: Further overrides.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / f"{name}.log").open("a") as log:
-        subprocess.run(
-            [
-                sys.executable,
-                "-m",
-                "armscan.run",
-                "-m",
-                f"sweep={sweep}",
-                f"study.name={name}",
-                *WITHOUT_FINAL_EVAL,
-                *words,
-            ],
-            cwd=folder,
-            env=os.environ | {"PYTHONPATH": str(REPOSITORY)},
-            stdout=log,
-            stderr=log,
-            check=True,
-        )
+    _wait_for(started(folder, *words, sweep=sweep, name=name, python=("-m", "armscan.run")), folder / f"{name}.log")
     return optuna.load_study(study_name=name, storage=open_storage(str(folder / JOURNAL)).optuna)
 
 
 def finish(folder: Path, *words: str) -> StudyState:
     """Run a study in a folder to its end, and return its state."""
-    if started(folder, *words).wait() != 0:
-        sys.exit((folder / "printed").read_text())
+    _wait_for(started(folder, *words), folder / f"{NAME}.log")
     return state_in(folder)
+
+
+def _wait_for(process: subprocess.Popen[bytes], log: Path) -> None:
+    if process.wait() != 0:
+        sys.exit(log.read_text())
 
 
 def state_in(folder: Path, uri: str = JOURNAL) -> StudyState:

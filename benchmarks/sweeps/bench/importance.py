@@ -53,9 +53,9 @@ def keys_of(curves: Curves, n_resamples: int) -> dict[str, Key]:
     for name in importances[0]:
         steps = np.array([of_resample[name][1] for of_resample in effects])
         found[name] = Key(
-            _estimate(np.array([each[name][0] for each in importances])),
-            _estimate(np.array([each[name][1] for each in importances])),
-            _estimate(steps.max(axis=1) / steps.min(axis=1)),
+            estimate_of(np.array([each[name][0] for each in importances])),
+            estimate_of(np.array([each[name][1] for each in importances])),
+            estimate_of(steps.max(axis=1) / steps.min(axis=1)),
             effects[0][name][0],
             np.column_stack([steps[0], *np.quantile(steps[1:], [0.025, 0.975], axis=0)]),
         )
@@ -97,6 +97,6 @@ def _importances(curves: Curves) -> dict[str, tuple[float, float]]:
     return {name: (shares[0][name], shares[1][name]) for name in distributions}
 
 
-def _estimate(values: FloatArray) -> Estimate:
-    """Return the first value with the 95 % interval of the others, its resamples."""
-    return Estimate(float(values[0]), *(float(end) for end in np.nanquantile(values[1:], [0.025, 0.975])))
+def estimate_of(values: FloatArray, *, method: str = "linear") -> Estimate:
+    """Return the first value with the 95 % interval of the others, its resamples; `method` is that of NumPy."""
+    return Estimate(float(values[0]), *map(float, np.nanquantile(values[1:], [0.025, 0.975], method=method)))

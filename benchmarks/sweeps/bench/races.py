@@ -9,6 +9,7 @@ import numpy as np
 
 from armscan.stats.bootstrap import Estimate
 from armscan.utils.arrays import FloatArray
+from benchmarks.sweeps.bench.importance import estimate_of
 from benchmarks.sweeps.bench.replay import Rule, scores_of, search
 from benchmarks.sweeps.bench.seed_rules import MAX_SEEDS, SeedRule, allocation, fixed, friedman_race, halving, t_race
 from benchmarks.sweeps.bench.surrogate import SimulatedConfig, Surrogate
@@ -110,8 +111,9 @@ def compare(fixed: Sequence[Choices], races: Mapping[str, Choices]) -> list[Comp
     for rule, race in races.items():
         regrets, n_trainings = race.regret[drawn].mean(axis=1), race.n_trainings[drawn].mean(axis=1)
         needed = np.array([needed_for(*pair, n_of_fixed) for pair in zip(regrets, of_fixed, strict=True)])
-        share = n_trainings / needed.clip(max=n_of_fixed[-1])
-        compared.append(Comparison(rule, _estimate(regrets), float(n_trainings[0]), float(needed[0]), _estimate(share)))
+        shares = n_trainings / needed.clip(max=n_of_fixed[-1])
+        regret, share = (estimate_of(each, method="inverted_cdf") for each in (regrets, shares))
+        compared.append(Comparison(rule, regret, float(n_trainings[0]), float(needed[0]), share))
     return compared
 
 
@@ -134,9 +136,3 @@ def needed_for(regret: float, regrets: FloatArray, n_trainings: FloatArray) -> f
     return float(
         n_trainings[first] - (n_trainings[first] - n_trainings[first - 1]) * (regret - below) / (above - below)
     )
-
-
-def _estimate(values: FloatArray) -> Estimate:
-    """Return the first value with the 95 % interval of the others, its resamples."""
-    low, high = np.quantile(values[1:], [0.025, 0.975], method="inverted_cdf")
-    return Estimate(float(values[0]), float(low), float(high))
