@@ -82,9 +82,15 @@ def launch(words: Sequence[str]) -> None:
     application(run)()
 
 
-def repeat_grid(words: Sequence[str]) -> None:
-    """Run the jobs of a grid that have not finished."""
-    Multirun.is_repeated = True
+def repeat_grid(words: Sequence[str], run_id: str, *, trust: bool) -> None:
+    """Run the jobs of a grid that have not finished.
+
+    Args:
+        words: Words that repeat it.
+        run_id: MLflow run ID of its parent run.
+        trust: Whether its jobs may build any class.
+    """
+    Multirun.repeats, Multirun.is_trusted = run_id, trust
     launch([MULTIRUN[0], *words])
 
 

@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -178,6 +179,15 @@ def made_read_only():
     return read_only
 
 
+@pytest.fixture
+def disk(tmp_path):
+    """Yield a disk of 20 MB, which can be filled."""
+    from tests.support.disks import small_disk
+
+    with small_disk(tmp_path / "disk", "20m") as disk:
+        yield disk
+
+
 @pytest.fixture(scope="session")
 def postgres_programs():
     """Return the folder of PostgreSQL's programs, which tests that start a server of their own need, too."""
@@ -209,10 +219,10 @@ def tracking_server(postgres, tmp_path_factory):
 @pytest.fixture(scope="session")
 def empty_database(tmp_path_factory):
     """Return an empty database with MLflow's tables, which take a second or more to create."""
-    from armscan.tracking import open_store
+    from tests.support.stores import store_in
 
     folder = tmp_path_factory.mktemp("store")
-    open_store(f"sqlite:///{folder}/mlruns.db", experiment="unused", artifacts=str(folder / "artifacts"), wait_s=60.0)
+    store_in(folder, "unused")
     return folder / "mlruns.db"
 
 
@@ -247,6 +257,13 @@ def armscan(tmp_path, monkeypatch, capsys):
         return code, printed.out, printed.err.strip()
 
     return command
+
+
+@pytest.fixture
+def evaluate(armscan, database, monkeypatch):
+    """Run `armscan evaluate` as `armscan` does, in a folder with an empty tracking database."""
+    monkeypatch.setenv("COLUMNS", "200")
+    return partial(armscan, "evaluate")
 
 
 @pytest.fixture

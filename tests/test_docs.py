@@ -7,7 +7,6 @@ import shlex
 import subprocess
 import sys
 from importlib import import_module
-from pathlib import Path
 
 import nbformat
 import pytest
@@ -15,10 +14,10 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from nbclient import NotebookClient
 
 from armscan.cli.main import armscan as program
+from tests.support import REPOSITORY
 
-ROOT = Path(__file__).parent.parent
-DOCS = ROOT / "docs"
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.glob("*.md"))]
+DOCS = REPOSITORY / "docs"
+PAGES = [REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md", *sorted(DOCS.glob("*.md"))]
 NOTEBOOKS = sorted((DOCS / "notebooks").glob("*.ipynb"))
 # Values for the placeholders that a user fills in.
 PLACEHOLDERS = {
@@ -124,7 +123,7 @@ def write_files(page, folder):
                 opened.write(block)
 
 
-@pytest.mark.parametrize("page", [ROOT / "README.md", DOCS / "environment.md"], ids=lambda page: page.name)
+@pytest.mark.parametrize("page", [REPOSITORY / "README.md", DOCS / "environment.md"], ids=lambda page: page.name)
 def test_code_of_pages_runs(page):
     names = {"__name__": page.stem}
     exec(compile("\n".join(blocks(page, "python")), str(page), "exec"), names)
@@ -168,9 +167,9 @@ def small(words):
     ],
 )
 def test_journeys_of_pages_are_made_with_small_budgets(page, tmp_path, data_folder):
-    write_files(ROOT / page, tmp_path)
+    write_files(REPOSITORY / page, tmp_path)
     done = 0
-    for words in commands(ROOT / page):
+    for words in commands(REPOSITORY / page):
         line = [word.replace("FOLDER", str(data_folder)) for word in words]
         if "ui" in line or "label" in line or any("resume=" in word or word == "ID" for word in line):
             continue
@@ -225,7 +224,7 @@ def test_page_links_to_what_is_there(page):
 
 
 def test_readme_is_short():
-    assert len((ROOT / "README.md").read_text().split()) <= 800
+    assert len((REPOSITORY / "README.md").read_text().split()) <= 800
 
 
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
@@ -250,7 +249,9 @@ def test_notebooks_on_the_site_load_nothing_from_elsewhere(notebook, monkeypatch
 )
 def test_notebooks_run(notebook, is_small, tmp_path):
     cells = nbformat.read(notebook, as_version=4)
-    assert all(cell.get("outputs", True) for cell in cells.cells[-1:]), "outputs are kept with the notebook"
+    ran = [cell.execution_count for cell in cells.cells if cell.cell_type == "code"]
+    assert ran == [*range(1, len(ran) + 1)], "outputs are kept with the notebook, from one run from top to bottom"
+    assert cells.cells[-1].outputs
     for cell in cells.cells if is_small else ():
         if "armscan run" in cell.source:
             (command,) = re.findall(r"armscan (run.*?) \| cat", cell.source, re.DOTALL)

@@ -5,7 +5,6 @@ import os
 import shlex
 import signal
 import subprocess
-import sys
 from collections import Counter
 from pathlib import Path
 
@@ -15,12 +14,12 @@ import torch
 from mlflow import MlflowClient
 
 from armscan.utils.files import sha256
+from tests.support import FEW_VOLUMES, REPOSITORY
+from tests.support.processes import COMMAND, start_run
 from tests.support.waiting import HANG_S, wait_until
 
 SMALL = [
-    "data.n_training=1",
-    "data.n_validation=1",
-    "data.n_test=1",
+    *FEW_VOLUMES,
     "training.env_steps=400",
     "training.eval_every_env_steps=200",
     "training.validation_episodes=2",
@@ -37,13 +36,12 @@ SMALL = [
 FEW = [word for word in SMALL if word.startswith(("data.", "evaluation.", "env."))]
 # Metrics that no two runs share.
 TIMES = ("wall_s", "speed/", "system/")
-REPOSITORY = Path(__file__).parent.parent
 
 
 def armscan_run(*arguments, cwd, **environment):
     """Run the command in its own process."""
     return subprocess.run(
-        [sys.executable, "-m", "armscan.run", *arguments],
+        [*COMMAND, *arguments],
         cwd=cwd,
         capture_output=True,
         text=True,
@@ -301,7 +299,7 @@ def test_run_on_labelmap_files(tmp_path, data_folder):
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
 def test_run_answers_a_mistake_in_one_line_and_leaves_nothing(answer, tmp_path, arguments, line):
-    few_phantoms = [] if "data=nifti" in arguments else ["data.n_training=1", "data.n_validation=1", "data.n_test=1"]
+    few_phantoms = [] if "data=nifti" in arguments else FEW_VOLUMES
     code, printed = answer(*arguments, *few_phantoms)
     assert code == 2
     assert printed.startswith(f"error: {line}")
@@ -359,11 +357,7 @@ def test_run_shows_what_is_wrong_with_a_volume(answer, tmp_path, write_labelmap,
 @pytest.mark.full
 @pytest.mark.parametrize("multirun", [[], ["-m", "seed=0,1", "hydra.launcher.n_jobs=2"]], ids=["single", "multirun"])
 def test_interrupted_run_is_closed_as_killed(tmp_path, multirun):
-    command = [sys.executable, "-m", "armscan.run", *multirun, *SMALL, "training.env_steps=500000"]
-    with (tmp_path / "printed").open("w") as printed:
-        process = subprocess.Popen(
-            command, cwd=tmp_path, stdout=printed, stderr=subprocess.STDOUT, start_new_session=True
-        )
+    process = start_run(*multirun, *SMALL, "training.env_steps=500000", cwd=tmp_path)
     n_jobs = 2 if multirun else 1
 
     def n_at_work():
@@ -391,18 +385,8 @@ def test_interrupted_run_is_closed_as_killed(tmp_path, multirun):
     ids=lambda value: getattr(value, "name", ""),
 )
 def test_job_that_is_ended_takes_no_other_with_it(tmp_path, ending, line):
-    command = [
-        sys.executable,
-        "-m",
-        "armscan.run",
-        "-m",
-        "seed=0,1",
-        "hydra.launcher.n_jobs=2",
-        *SMALL,
-        "training.env_steps=8000",
-    ]
-    with (tmp_path / "printed").open("w") as printed:
-        process = subprocess.Popen(command, cwd=tmp_path, stdout=printed, stderr=subprocess.STDOUT)
+    words = ["-m", "seed=0,1", "hydra.launcher.n_jobs=2", *SMALL, "training.env_steps=8000"]
+    process = start_run(*words, cwd=tmp_path)
 
     def are_tracked():
         return all(label in (tmp_path / "printed").read_text() for label in ("[0 seed=0]", "[1 seed=1]"))

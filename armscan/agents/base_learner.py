@@ -65,6 +65,8 @@ class BaseLearner(ABC):
 class SupervisedLearner(BaseLearner):
     """Learner of one network, supervised with the labelled planes of the episodes.
 
+    Subclasses apply the setup's `compute` to the part of the network that both learning and acting call.
+
     Every epoch begins with new episodes and seeds all random numbers with (`seed`, epoch), so that a learner resumes
     from its state bit for bit.
 
@@ -81,7 +83,6 @@ class SupervisedLearner(BaseLearner):
         self._network = network.to(self._device)
         self._optimiser = torch.optim.Adam(self._network.parameters(), lr=lr)
         self._n_env_steps = 0
-        setup.compute.apply_to(self._network)
 
     @property
     def n_env_steps(self) -> int:

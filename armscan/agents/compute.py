@@ -74,7 +74,9 @@ def plain_copy(network: nn.Module) -> nn.Module:
 
     # The copy of a compiled network is not compiled.
     copied = deepcopy(network)
-    vars(copied).pop("forward", None)
+    # Parts that other networks share may compute in another precision too.
+    for module in copied.modules():
+        vars(module).pop("forward", None)
     return copied.to("cpu", torch.float32)
 
 

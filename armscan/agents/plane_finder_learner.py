@@ -70,11 +70,13 @@ class PlaneFinderLearner(SupervisedLearner):
         )
         self._module: PlaneModule = module
         super().__init__(module, finder.lr, envs, setup)
+        # Not to the module, whose forward learning bypasses, and whose geometry requires 32 bits.
+        setup.compute.apply_to(network)
         self._calibration_envs = setup.make_validation_envs and setup.make_validation_envs(N_CALIBRATION)
         self.expected_error: tuple[float, float] | None = None
-        """Expected errors of the plane that `act` chose last, in mm and degrees."""
-        self.expected_errors: FloatArray = np.empty((0, 2))
-        """Expected errors of the planes that `act_all` chose last in each episode, shape (n, 2)."""
+        """Expected errors of the plane that `act` chose last, in mm and degrees; None if it is not this network's."""
+        self.expected_errors: NDArray[Any] = np.empty((0, 2))
+        """Expected errors of the planes that `act_all` chose last in each episode, shape (n, 2), or None."""
 
     @property
     def env_steps_at_once(self) -> int:
@@ -204,7 +206,7 @@ class PlaneFinderLearner(SupervisedLearner):
         """See `BatchAgent.begin_all`."""
         for seed, its_bounds in zip(seeds, bounds, strict=True):
             self.begin(seed=seed, bounds=its_bounds)
-        self.expected_errors = np.full((len(seeds), 2), np.nan)
+        self.expected_errors = np.full((len(seeds), 2), None)
 
     def act_all(self, observations: Observed, rewards: FloatArray, episodes: NDArray[np.int64]) -> FloatArray:
         """See `BatchAgent.act_all`; one by one, because convolutions of a larger batch differ in the last bits."""

@@ -127,7 +127,7 @@ class PPO(PolicyParameters):
         )
         replay = replay_for(setup.observation_space, n_collected, self.num_envs)
         params = OnPolicyTrainerParams(
-            **training_parameters(policy, envs, replay),
+            **training_parameters(policy, envs, replay, setup.compute),
             collection_step_num_env_steps=n_collected,
             update_step_num_repetitions=self.n_epochs,
             batch_size=self.batch_size,

@@ -54,6 +54,7 @@ class RegressionLearner(SupervisedLearner):
         n_action = len(setup.action_names)
         actor = network.actor(setup.observation_space, n_action, log_std=-0.5)
         super().__init__(actor, parameters.lr, setup.make_envs(parameters.num_envs), setup)
+        setup.compute.apply_to(actor)
         self._examples = SupervisedBuffer(size, setup.observation_space, n_action)
         self._inference = Inference(self._network, clip_action, setup.compute)
 

@@ -17,7 +17,9 @@ from armscan.agents.protocols import AgentSetup
 from armscan.agents.residual_envs import ResidualVectorEnv, feature_space
 from armscan.agents.sac import SAC
 from armscan.envs.actions import COMPONENTS
+from armscan.envs.rules import Observed
 from armscan.errors import InvalidValueError
+from armscan.utils.arrays import FloatArray
 
 
 class ResidualModule(nn.Module):
@@ -133,6 +135,14 @@ class ResidualLearner(PlaneFinderLearner):
             self._corrected.is_corrected.fill_(1.0)
             n_env_steps = max(1, n_env_steps - self._sac.n_env_steps)
         return self._sac.learn(n_env_steps)
+
+    def act(self, observation: Observed, reward: float) -> FloatArray:
+        """Return the next plane, shape (n_action,); the errors of corrected planes are not expected."""
+        action = super().act(observation, reward)
+        if self._corrected.is_corrected:
+            # Those of the plane finder are calibrated on the planes before their correction.
+            self.expected_error = None
+        return action
 
     def state(self) -> dict[str, Any]:
         """Return the states of the plane finder and of SAC."""

@@ -30,7 +30,9 @@ class ResidualSAC(PlaneFinder):
     """
 
     sac: SAC
-    """Hyperparameters of SAC; `learning_starts` counts environment steps with random corrections."""
+    """Hyperparameters of SAC; `learning_starts` counts environment steps with random corrections, and
+    `deterministic_eval` must be true.
+    """
 
     pretraining_env_steps: int
     """Number of environment steps of the pretraining; SAC gets the rest of `training.env_steps`."""
@@ -45,6 +47,10 @@ class ResidualSAC(PlaneFinder):
         super().__post_init__()
         if not isinstance(self.sac, SAC):
             raise InvalidValueError(f"agent.sac is {self.sac!r}, but it must be hyperparameters of SAC")
+        if not self.sac.deterministic_eval:
+            raise InvalidValueError(
+                "agent.sac.deterministic_eval is False, but it must be true: evaluations never draw corrections"
+            )
         check_int("agent.pretraining_env_steps", self.pretraining_env_steps, at_least=1)
 
     def agent(self, setup: AgentSetup) -> ResidualLearner:

@@ -139,7 +139,7 @@ class SAC(PolicyParameters):
             ),
         )
         params = OffPolicyTrainerParams(
-            **training_parameters(policy, envs, replay),
+            **training_parameters(policy, envs, replay, setup.compute),
             collection_step_num_env_steps=n_collected,
             update_step_num_gradient_steps_per_sample=self.utd_ratio,
             batch_size=self.batch_size,

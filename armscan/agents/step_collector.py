@@ -17,6 +17,7 @@ from torch.distributions import Distribution, Independent, Normal
 from torch.nn.functional import linear
 
 from armscan.agents.compiled_sac import layer_sizes
+from armscan.agents.compute import Compute
 from armscan.agents.replay import Replay
 from armscan.agents.tianshou_envs import TianshouVectorEnv, batched
 from armscan.envs.rules import Observed
@@ -27,6 +28,8 @@ Actions = NDArray[np.float32]
 class StepCollector(Collector[CollectStats]):
     """Tianshou's collector, which collects steps of Gaussian policies as arrays, with the same result to the bit.
 
+    Only lengths differ: an episode of which the buffer no longer holds all transitions counts in full.
+
     Tianshou makes some 7,000 Python calls for a step of all environments, most of them for a `Batch` that is made only
     to be copied into the replay buffer. `collect` and `_is_plain` decide when arrays are used.
 
@@ -34,13 +37,15 @@ class StepCollector(Collector[CollectStats]):
         policy: Policy that chooses the actions.
         envs: Training environments.
         replay: Replay buffer to add transitions to.
+        compute: Device and precision of the policy.
     """
 
-    def __init__(self, policy: Any, envs: TianshouVectorEnv, replay: Replay) -> None:
+    def __init__(self, policy: Any, envs: TianshouVectorEnv, replay: Replay, compute: Compute) -> None:
         super().__init__(policy, envs, replay, exploration_noise=True)
         self._envs, self._replay = envs, replay
         actor = policy.actor
-        self._layers = [each for each in actor.modules() if isinstance(each, nn.Linear)] if layer_sizes(actor) else None
+        is_bypassed = layer_sizes(actor) is not None and compute.precision == "float32"
+        self._layers = [each for each in actor.modules() if isinstance(each, nn.Linear)] if is_bypassed else None
 
     def _is_plain(self, render: float | None, reset_arguments: dict[str, Any] | None) -> bool:
         """Return whether steps are collected as arrays: Gaussian policies without hooks, rendering or reset options."""
@@ -143,7 +148,7 @@ class StepCollector(Collector[CollectStats]):
         """
         observations_next, rewards, terminated, truncated = self._envs.advance(sent)
         done = terminated | truncated
-        places, returns, _, starts = self._replay.add(
+        _, returns, lengths, _ = self._replay.add(
             {
                 "obs": observations,
                 "act": actions,
@@ -158,8 +163,5 @@ class StepCollector(Collector[CollectStats]):
         if done.any():
             # Observations of all environments, also of those that are not reset.
             observations_next = self._envs.begin(done)
-        # Lengths as Tianshou counts them: the transitions that are still in the buffer.
-        kept = [
-            self._replay.get_buffer_indices(*each).size for each in zip(starts[done], places[done] + 1, strict=True)
-        ]
-        return observations_next, np.array([returns[done], kept])
+        # Not as Tianshou counts lengths, by the transitions in the buffer, which PPO empties in the middle of episodes.
+        return observations_next, np.array([returns[done], lengths[done]])

@@ -18,6 +18,7 @@ from tianshou.trainer import OffPolicyTrainer, OnPolicyTrainer
 
 from armscan.agents.base_learner import BaseLearner, diverged, is_finite, load_into, prepare_torch
 from armscan.agents.compiled_sac import CompiledSAC
+from armscan.agents.compute import Compute
 from armscan.agents.epoch_metrics import EpochMetrics
 from armscan.agents.hyperparameters import Parameters
 from armscan.agents.inference import Inference
@@ -221,10 +222,12 @@ def training_envs(setup: AgentSetup, num_envs: int) -> TianshouVectorEnv:
     return envs
 
 
-def training_parameters(policy: TianshouPolicy, envs: TianshouVectorEnv, replay: Replay) -> dict[str, Any]:
+def training_parameters(
+    policy: TianshouPolicy, envs: TianshouVectorEnv, replay: Replay, compute: Compute
+) -> dict[str, Any]:
     """Return the parameters that Tianshou's trainers share."""
     return {
-        "training_collector": StepCollector(policy, envs, replay),
+        "training_collector": StepCollector(policy, envs, replay, compute),
         "logger": EpochMetrics(),
         "verbose": False,
         "show_progress": False,

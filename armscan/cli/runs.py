@@ -151,7 +151,7 @@ def stop(target: str, storage: str, tracking: str) -> None:
     as finished; a run outside a study is interrupted as by Ctrl-C.
     """
     from armscan.runs.stop import interrupt, target_of
-    from armscan.sweeps.stop import is_study, stop_study, stop_trial
+    from armscan.sweeps.stop import check_tracked, is_study, stop_study, stop_trial
     from armscan.sweeps.storage.storage import existing_storage
     from armscan.tracking import find_run
 
@@ -165,7 +165,9 @@ def stop(target: str, storage: str, tracking: str) -> None:
             raise TrackingError(f"{error}; and {storage} has no study {target!r}") from error
     if (found := target_of(run)) is None:
         print(interrupt(run))
-    elif found.trial is None:
+        return
+    check_tracked(storage, found.study, found.trial, runs=found.runs, stored_in=found.storage)
+    if found.trial is None:
         print(stop_study(storage, found.study))
     else:
         print(stop_trial(storage, found.study, found.trial))
@@ -181,13 +183,17 @@ def sync(folder: Path, tracking: str | None, trust: bool) -> int:
     FOLDER is the folder of a run, of a study, or above them. Nothing is uploaded twice, and running runs upload
     by themselves. Exit code: 1 if something is left.
     """
+    from armscan.config.defaults import default_tracking
     from armscan.config.trust import check_stored_address
     from armscan.tracking import open_existing_store
     from armscan.tracking import sync as upload_left
+    from armscan.tracking.notes import notes
+
+    own = {default_tracking()["uri"], *(note.uri for note in notes().values())}
 
     def opened(tracked_in: str) -> TrackingStore:
         if tracking is None and not trust:
-            check_stored_address(tracked_in)
+            check_stored_address(tracked_in, own)
         return open_existing_store(tracking or tracked_in)
 
     uploads = upload_left(folder, cache(opened), trust=trust)

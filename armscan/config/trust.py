@@ -8,22 +8,23 @@ it, and interpolations are refused.
 from __future__ import annotations
 
 import functools
-import os
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
-from armscan.config.credentials import SERVER_SECRETS
-from armscan.config.defaults import default_tracking
 from armscan.config.legacy import migrate
-from armscan.config.sources import config_folder, sweeps_folder
+from armscan.config.sources import config_folder, own_folders, sweeps_folder
 from armscan.errors import UntrustedError
+from armscan.utils.files import SQLITE_PREFIX
 
 TRUST = "--trust"
 HOW = f"if you trust its author, repeat the command with {TRUST}"
 TARGET, INTERPOLATION = "_target_", "${"
-TARGETS = re.compile(rf"{TARGET}: *([\w.]+)")
+TARGETS = re.compile(rf"""{TARGET}["']?: *["']?([\w.]+)""")
 SERVER = re.compile(r"(?<![\w+.-])(?!sqlite:)[\w+.-]+://")
+# A path that leads out of a group of the configuration: Hydra composes any YAML file that the choice of a group names.
+OUTSIDE = re.compile(r"\.\.|(?<![\w-])/")
 # Of grids and studies; the configuration of a run names none of their classes.
 GROUPS_OF_COMMANDS = ("hydra", "study")
 PACKAGES_OF_COMMANDS = ("armscan.launch.", "armscan.sweeps.")
@@ -34,12 +35,12 @@ def offered_classes() -> frozenset[str]:
     """Return the names of the classes and functions that armscan's own configuration builds runs from."""
     root = config_folder()
     files = [path for path in root.rglob("*.yaml") if path.relative_to(root).parts[0] not in GROUPS_OF_COMMANDS]
-    names = {
-        name
-        for file in [*files, *sweeps_folder().glob("*.yaml")]
-        for name in TARGETS.findall(file.read_text(encoding="utf-8"))
-    }
+    names = _classes_in([*files, *sweeps_folder().glob("*.yaml")])
     return frozenset(name for name in names if not name.startswith(PACKAGES_OF_COMMANDS))
+
+
+def _classes_in(files: Iterable[Path]) -> set[str]:
+    return {name for file in files for name in TARGETS.findall(file.read_text(encoding="utf-8"))}
 
 
 def stored_config(config: Mapping[str, Any], *, where: str, trust: bool) -> dict[str, Any]:
@@ -54,20 +55,34 @@ def stored_config(config: Mapping[str, Any], *, where: str, trust: bool) -> dict
         UntrustedError: If it names a class that armscan does not offer, or holds an interpolation.
     """
     config = migrate(config)
-    if not trust and (found := _foreign_part(config)):
+    if not trust and (found := _foreign_part(config, offered_classes())):
         raise UntrustedError(f"{where}: its configuration {found}; {HOW}")
     return config
 
 
+def check_composed(config: Mapping[str, Any], *, where: str) -> None:
+    """Raise `UntrustedError` if a configuration, composed from stored words, names a class that no file here names.
+
+    The files are armscan's own, and those in `./conf` and `./sweeps` of the working folder.
+
+    Args:
+        config: Resolved configuration.
+        where: Owner of the configuration, such as `job 3`, for the error.
+    """
+    own = _classes_in(file for folder in own_folders().values() for file in folder.rglob("*.yaml"))
+    if found := _foreign_part(config, offered_classes() | own):
+        raise UntrustedError(f"{where}: its configuration {found}; {HOW}")
+
+
 def needs_trust(config: Mapping[str, Any]) -> bool:
     """Return whether a run with this configuration, or these MLflow parameters, can be read only with `--trust`."""
-    return _foreign_part(migrate(config)) is not None
+    return _foreign_part(migrate(config), offered_classes()) is not None
 
 
-def _foreign_part(config: Mapping[str, Any]) -> str | None:
-    """Return the part of a configuration that is not armscan's own; None if there is none."""
+def _foreign_part(config: Mapping[str, Any], allowed: Collection[str]) -> str | None:
+    """Return the part of a configuration that builds anything but these classes; None if there is none."""
     for key, value in _leaves(config):
-        if key.rpartition(".")[2] == TARGET and str(value) not in offered_classes():
+        if key.rpartition(".")[2] == TARGET and str(value) not in allowed:
             return (
                 f"builds {key.removesuffix(f'.{TARGET}')} by {value!r}, which is none of armscan's classes and would "
                 "execute code of others"
@@ -95,7 +110,10 @@ def untrusted_word(words: Sequence[str], uri: str) -> str | None:
         value = value.strip("'\"")
         # A server is sent this user's password.
         is_elsewhere = value != uri and SERVER.search(value) is not None
-        if is_elsewhere or TARGET in plain or INTERPOLATION in plain or "hydra" in key or key.startswith("-"):
+        is_changing_hydra = "hydra" in key or key.startswith("-")
+        # A key with dots is a value, which may be any path, and never a group.
+        is_outside = "." not in key.partition("@")[0] and OUTSIDE.search(value) is not None
+        if is_elsewhere or is_changing_hydra or is_outside or TARGET in plain or INTERPOLATION in plain:
             return word
     return None
 
@@ -115,11 +133,21 @@ def check_stored_words(words: Sequence[str], uri: str, *, where: str) -> None:
         )
 
 
-def check_stored_address(uri: str) -> None:
-    """Raise `UntrustedError` if a stored address would be sent a password that is meant for another server."""
-    secrets = [name for name in SERVER_SECRETS if os.environ.get(name)]
-    if uri.startswith("http") and secrets and uri != default_tracking()["uri"]:
-        raise UntrustedError(f"{uri} would be sent this user's {secrets[0]}: give --tracking {uri} if it is yours")
+def check_stored_address(uri: str, own: Collection[str]) -> None:
+    """Raise `UntrustedError` if a stored address is that of a server which is not known as this user's.
+
+    Clients find passwords in many places, such as the environment, its files, `~/.pgpass` and `~/.mlflow/credentials`,
+    and send them to the server that they are told to use.
+
+    Args:
+        uri: Address of a tracking store, as a folder or a store names it.
+        own: Addresses of this user's stores.
+    """
+    if not uri.startswith(SQLITE_PREFIX) and uri not in own:
+        raise UntrustedError(
+            f"{uri} is not a store that this user has used here, and it could be sent this user's passwords: give "
+            f"--tracking {uri} if it is yours"
+        )
 
 
 def _leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:

@@ -13,7 +13,14 @@ from armscan.config.command_hints import resume_command
 from armscan.envs import EnvFactory
 from armscan.errors import CheckpointError, InvalidValueError, OptimalPlaneError, listed, printable
 from armscan.evaluation.agent_source import TrainedAgent
-from armscan.evaluation.volumes import TrainingVolumes, Volumes, known_volumes, own_split, volume_groups
+from armscan.evaluation.volumes import (
+    TrainingVolumes,
+    Volumes,
+    known_volumes,
+    own_split,
+    phantom_version,
+    volume_groups,
+)
 from armscan.experiment.agent import make_agent
 from armscan.experiment.build import apply_crop, make_env_factory, on_plane_of
 from armscan.tracking import FoundRun
@@ -85,7 +92,8 @@ def apply(
 
     Args:
         source: Agent to apply.
-        data: Folder of volumes, `phantom`, or None for the volumes of the agent's own configuration.
+        data: Folder of volumes, `phantom` for new phantoms of the version in the agent's configuration, or None for
+            the volumes of that configuration.
         n_phantoms: Number of phantoms, 1 or more; used for `phantom` only.
         check: Function that raises an error if the volumes, by their labels, do not suit the caller.
         render_mode: Gymnasium render mode of the environments. Default: None.
@@ -96,7 +104,7 @@ def apply(
     # On other volumes, only the training volumes matter among its own: the reward is fitted to them.
     parts = ("training",) if data else PARTS
     own = cache(partial(own_split, source, parts))
-    groups = volume_groups(data, n_phantoms, own)
+    groups = volume_groups(data, n_phantoms, own, phantom_version(source))
     check(groups)
     prepared = prepare(source, groups, own, render_mode=render_mode)
     notes = list(prepared.notes)

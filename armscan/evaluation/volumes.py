@@ -17,6 +17,7 @@ from armscan.training import PARTS, TEST, TRAINING, VALIDATION, Split, check_unc
 from armscan.utils.files import check_writable
 from armscan.volumes import LabelVolume, load_phantoms, open_dataset
 from armscan.volumes.dataset import SPLITS
+from armscan.volumes.phantom import VERSIONS
 
 # Above the seeds of a run's phantoms: its test phantoms begin a million below.
 PHANTOMS_FIRST_SEED = 3_000_000
@@ -52,19 +53,27 @@ def own_split(source: TrainedAgent, parts: Sequence[str] = PARTS) -> Split:
     return split
 
 
-def volume_groups(data: str | None, n_phantoms: int, own: Callable[[], Split]) -> dict[str, Volumes]:
+def phantom_version(source: TrainedAgent) -> int:
+    """Return the version of the phantoms in an agent's own configuration; 1 if it names none of them."""
+    named = source.config.data.get("version")
+    return next((version for version in VERSIONS if version == named), 1)
+
+
+def volume_groups(data: str | None, n_phantoms: int, own: Callable[[], Split], version: int = 1) -> dict[str, Volumes]:
     """Return the volumes to evaluate on, by group name.
 
     Args:
         data: Folder, `phantom` for phantoms that no run trains on, or None for the agent's own volumes.
         n_phantoms: Number of phantoms.
         own: Function that reads the agent's own volumes.
+        version: Version of the phantoms. Default: 1.
     """
     if data is None:
         split = own()
         return {TRAINING: split.training, VALIDATION: split.validation, TEST: split.test}
     if data == PHANTOM:
-        return {"new phantoms": load_phantoms(range(PHANTOMS_FIRST_SEED, PHANTOMS_FIRST_SEED + n_phantoms), None)}
+        label = "new phantoms" if version == 1 else f"new phantoms of version {version}"
+        return {label: load_phantoms(range(PHANTOMS_FIRST_SEED, PHANTOMS_FIRST_SEED + n_phantoms), None, version)}
     dataset = open_dataset(data)
     groups = {f"{split} split": dataset.volumes_of(split) for split in SPLITS}
     return {label: volumes for label, volumes in groups.items() if volumes} or {"volumes": dataset.volumes}
@@ -117,8 +126,8 @@ def known_volumes(source: TrainedAgent, groups: Mapping[str, Volumes]) -> list[s
             notes.append(f"{what} these volumes: {', '.join(shown)}")
         names = had or source.run.tags.get(f"volumes.{part}", "").split(" ")
         if others := [name for name in volumes if name in names and name not in same]:
-            which = "other volumes" if had else "volumes"
-            notes.append(f"{what} {which} of these names: {', '.join(others)}")
+            which = ", but with other voxels or another plane" if had else ""
+            notes.append(f"{what} volumes of these names{which}: {', '.join(others)}")
     return notes
 
 

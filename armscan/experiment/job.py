@@ -52,7 +52,8 @@ class Job:
         varied: Overrides that differ from those of the other jobs.
         parent_run_id: MLflow run ID of its parent run.
         folder: Folder of the multirun.
-        is_repeated: Whether to skip it if it has finished before. Default: False.
+        repeats: MLflow run ID of the grid that is repeated without its finished jobs. Default: None, a new grid.
+        is_trusted: Whether it may build any class; false if its words were stored. Default: True.
     """
 
     number: int
@@ -60,7 +61,8 @@ class Job:
     varied: str
     parent_run_id: str
     folder: Path
-    is_repeated: bool = False
+    repeats: str | None = None
+    is_trusted: bool = True
 
     @classmethod
     def current(cls) -> Self | None:
@@ -71,11 +73,10 @@ class Job:
         folder = Path(hydra_config.sweep.dir)
         parent = json.loads((folder / PARENT_FILE).read_text())
         overrides = list(hydra_config.overrides.task)
-        # Hydra passes booleans on in Python's spelling, False for false.
-        common = {override.lower() for override in parent["overrides"]}
-        varied = [override for override in overrides if override.lower() not in common]
+        varied = [override for override in overrides if override not in parent["common"]]
         words = shlex.join(overrides), " ".join(varied)
-        return cls(hydra_config.job.num, *words, parent["run_id"], folder, is_repeated=parent["is_repeated"])
+        repeated = parent["repeats"], parent["is_trusted"]
+        return cls(hydra_config.job.num, *words, parent["run_id"], folder, *repeated)
 
     @property
     def label(self) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import socket
 from collections.abc import Mapping
 from operator import methodcaller
@@ -31,7 +32,10 @@ from armscan.utils.files import (
     CONFIG_FILE,
     DIFF_FILE,
     ENVIRONMENT_FILE,
+    POLICY_FOLDER,
+    REPRODUCTION_FILE,
     RESULTS,
+    RESUMED_DIFF_FILE,
     SHA256_TAGS,
     VOLUMES_FILE,
     atomic_write,
@@ -67,9 +71,7 @@ def start_tracking(
     upload_pending(client)
     choices, job = invocation.choices, invocation.job
     files = provenance_files(resolved, setup)
-    # Results of an earlier run in the same folder would be taken for this run's.
-    for stale in RESULTS:
-        (invocation.folder / stale).unlink(missing_ok=True)
+    _remove_earlier(invocation.folder)
     # Before the run exists, so that it can be resumed whenever it is killed.
     for name, contents in files.items():
         atomic_write(invocation.folder / name, methodcaller("write", contents))
@@ -99,6 +101,15 @@ def start_tracking(
     tracked.log_datasets(setup.fingerprints)
     tracked.log_files(*(invocation.folder / name for name in files))
     return tracked
+
+
+def _remove_earlier(folder: Path) -> None:
+    """Remove what an earlier run has left in a folder, and would be taken for the new run's."""
+    names = (*RESULTS, DIFF_FILE, REPRODUCTION_FILE)
+    for stale in (*(folder / name for name in names), *folder.glob(RESUMED_DIFF_FILE.format("*"))):
+        stale.unlink(missing_ok=True)
+    # A link is not followed.
+    shutil.rmtree(folder / POLICY_FOLDER, ignore_errors=True)
 
 
 def provenance_files(config: dict[str, Any], setup: Experiment) -> dict[str, bytes]:

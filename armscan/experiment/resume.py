@@ -7,9 +7,9 @@ continues.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import yaml
 from omegaconf import OmegaConf
@@ -42,12 +42,19 @@ if TYPE_CHECKING:
     from mlflow.entities import Run
 
 
-def resume(words: Sequence[str], repeat_grid: Callable[[Sequence[str]], None]) -> None:
+class RepeatGrid(Protocol):
+    """Function that runs the unfinished jobs of the grid that its words describe; see `armscan.run.repeat_grid`."""
+
+    def __call__(self, words: Sequence[str], run_id: str, *, trust: bool) -> None:
+        """Run them."""
+
+
+def resume(words: Sequence[str], repeat_grid: RepeatGrid) -> None:
     """Resume the run that a command line names.
 
     Args:
         words: Overrides on the command line.
-        repeat_grid: Function that runs the unfinished jobs of the grid that its words describe.
+        repeat_grid: Function that runs the unfinished jobs of a grid.
 
     Raises:
         InvalidValueError: If the words say anything else.
@@ -67,7 +74,7 @@ def resume(words: Sequence[str], repeat_grid: Callable[[Sequence[str]], None]) -
     if not trust:
         _check_grid(run, grid, uri)
     _enter_working_folder(run)
-    repeat_grid(grid)
+    repeat_grid(grid, run.info.run_id, trust=trust)
 
 
 def _grid_of(run: Run) -> list[str]:

@@ -58,7 +58,7 @@ def run_job(launcher_pid: int) -> None:
     for ending in ENDINGS:
         signal.signal(ending, leave)
     try:
-        if job.is_repeated:
+        if job.repeats is not None:
             from armscan.launch.resume_grid import run_again
 
             metrics = run_again(config, invocation, job)

@@ -12,6 +12,7 @@ from operator import methodcaller
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
@@ -43,8 +44,9 @@ class Multirun(Callback):
     """
 
     folder: Path | None = None
-    # Whether this multirun repeats an earlier one, without the jobs that have finished.
-    is_repeated = False
+    # Run ID of the grid that this multirun repeats without its finished jobs, and whether they may build any class.
+    repeats: str | None = None
+    is_trusted = True
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Check the addresses that a single run would store."""
@@ -82,10 +84,20 @@ class Multirun(Callback):
         again = [*overrides, *hydra_words, f"{TRACKING_URI}='{tracking['uri']}'"]
         tags = {**source().tags, "overrides": command, "working_folder": str(Path.cwd()), GRID_TAG: json.dumps(again)}
         run = client.create_run(experiment_id, name=f"multirun {command}"[:250], tags=tags)
-        parent = {"run_id": run.info.run_id, "tracking": tracking, "overrides": overrides}
-        parent |= {"is_repeated": Multirun.is_repeated, "trust": untrusted_word(again, tracking["uri"]) is not None}
+        parent = {"run_id": run.info.run_id, "tracking": tracking, "overrides": overrides, "common": _common(overrides)}
+        parent |= {"repeats": Multirun.repeats, "is_trusted": Multirun.is_trusted}
+        # Also if it was resumed with --trust.
+        is_told = Multirun.repeats is not None and Multirun.is_trusted
+        parent |= {"trust": is_told or untrusted_word(again, tracking["uri"]) is not None}
         (folder / PARENT_FILE).write_text(json.dumps(parent))
         Multirun.folder = folder
+
+
+def _common(overrides: Sequence[str]) -> list[str]:
+    """Return the overrides that all jobs share, as Hydra spells them for each job: `agent.lr=0.001` for `1e-3`."""
+    # The last override of a key counts.
+    by_key = {each.get_key_element(): each for each in OverridesParser.create().parse_overrides([*overrides])}
+    return [f"{key}={each.get_value_element_as_str()}" for key, each in by_key.items() if not each.is_sweep_override()]
 
 
 @contextmanager

@@ -1,16 +1,20 @@
 """`armscan run resume=ID` of a grid: repeat it without the jobs that have finished.
 
-A job's earlier run is found by the checksums of its configuration and its volumes.
+A job's earlier run is found by the checksums of its configuration and its volumes. The new grid takes it over.
 """
 
 from __future__ import annotations
 
+import contextlib
+import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
 from armscan.config.defaults import to_plain
+from armscan.config.trust import check_composed
 from armscan.experiment.build import check_keys, set_up
 from armscan.experiment.job import Invocation, Job
 from armscan.experiment.provenance import provenance_files, sha256_tags
@@ -18,7 +22,7 @@ from armscan.experiment.results import LAST_VALIDATION, figures_of
 from armscan.experiment.resume import resume_run
 from armscan.experiment.runner import run_experiment
 from armscan.tracking import TrackingStore, open_store
-from armscan.tracking.tags import FOLDER_TAG, JOB_TAG, PARENT_TAG
+from armscan.tracking.tags import FOLDER_TAG, GRID_TAG, JOB_TAG, PARENT_TAG, STUDY_TAG
 from armscan.utils.files import LAST_CHECKPOINT
 
 if TYPE_CHECKING:
@@ -30,12 +34,12 @@ Metrics = dict[str, dict[str, float]]
 def run_again(config: DictConfig, invocation: Invocation, job: Job) -> Metrics:
     """Return the metrics of a job's finished run; resume an interrupted one, or run the job."""
     check_keys(config)
-    setup, tracking = set_up(config), to_plain(config.tracking)
-    client, experiment_id = open_store(**tracking)
-    # Runs of this configuration on these volumes, the latest first.
-    sums = sha256_tags(provenance_files(to_plain(config), setup))
-    wanted = " and ".join(f"tags.`{tag}` = '{value}'" for tag, value in sums.items())
-    earlier = client.search_runs([experiment_id], wanted, order_by=["attributes.start_time DESC"])
+    resolved = to_plain(config)
+    if not job.is_trusted:
+        check_composed(resolved, where=f"job {job.number}")
+    setup = set_up(config)
+    client, experiment_id = open_store(**resolved["tracking"])
+    earlier = earlier_runs(client, experiment_id, sha256_tags(provenance_files(resolved, setup)), job)
     for run in earlier:
         if run.info.status == "FINISHED":
             print(f"[{job.label}] has finished before: run {run.info.run_id}", flush=True)
@@ -48,6 +52,36 @@ def run_again(config: DictConfig, invocation: Invocation, job: Job) -> Metrics:
             # Trusted, because its configuration is this job's.
             return resume_run(client, run.info.run_id, job_label=job.label, trust=True)
     return run_experiment(config, invocation)
+
+
+def earlier_runs(client: TrackingStore, experiment_id: str, sums: Mapping[str, str], job: Job) -> list[Run]:
+    """Return the earlier runs of a job: first those of the repeated grid, and each time the latest first.
+
+    The others are single runs, and jobs of grids with the same command line, such as an earlier repetition. Trials of
+    studies, and jobs of other grids, belong to those.
+
+    Args:
+        client: Store of the runs.
+        experiment_id: ID of their MLflow experiment.
+        sums: Checksums of the job's configuration and volumes, as tags.
+        job: Job to repeat.
+    """
+    wanted = " and ".join(f"tags.`{tag}` = '{value}'" for tag, value in sums.items())
+    found = client.search_runs([experiment_id], wanted, order_by=["attributes.start_time DESC"])
+    parents = {run.info.run_id: run.data.tags.get(PARENT_TAG) for run in found if STUDY_TAG not in run.data.tags}
+    known = [each for each in {*parents.values(), job.parent_run_id} if each is not None and each.isalnum()]
+    grids = client.runs([experiment_id], f"attributes.run_id IN ({', '.join(map(repr, known))})")
+    words = {grid.info.run_id: _words_of(grid) for grid in grids}
+    kin = {grid for grid in words if words[grid] == words.get(job.parent_run_id)} | {job.repeats, None}
+    own = [run for run in found if run.info.run_id in parents and parents[run.info.run_id] in kin]
+    return sorted(own, key=lambda run: parents[run.info.run_id] != job.repeats)
+
+
+def _words_of(grid: Run) -> set[str]:
+    """Return the different words that repeat a grid; a repetition adds some again. None of a run that is no grid."""
+    with contextlib.suppress(ValueError, TypeError):
+        return set(json.loads(grid.data.tags[GRID_TAG])) if GRID_TAG in grid.data.tags else set()
+    return set()
 
 
 def _set_parent(client: TrackingStore, run: Run, job: Job) -> None:

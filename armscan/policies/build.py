@@ -51,7 +51,7 @@ def save_policy(agent: Learner, env: Env, tracked: TrackedRun, folder: Path, tel
     try:
         make_model(agent, env, model, facts_of(config, env, tracked.run_id))
     except ExportError as error:
-        # The model of an earlier run in the same folder.
+        # A model that the run made before it was interrupted.
         shutil.rmtree(model, ignore_errors=True)
         tell(f"the policy is not kept as a model: {error}")
         tracked.set_tags({POLICY_TAG: f"not kept: {error}"})

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 import signal
+from collections.abc import Collection
 from dataclasses import dataclass
 
 from mlflow.entities import Run
 
 from armscan.errors import TrackingError
 from armscan.tracking.notes import Note
-from armscan.tracking.tags import STUDY_TAG, TRIAL_TAG
+from armscan.tracking.tags import PARENT_TAG, STORAGE_TAG, STUDY_TAG, TRIAL_TAG
 
 
 @dataclass(frozen=True)
@@ -20,10 +21,14 @@ class Target:
     Args:
         study: Name of the study.
         trial: Number of the trial; None for the whole study.
+        runs: MLflow run IDs, one of which the storage has noted: of the run and its parent.
+        storage: Address of the study's storage; None if the run does not name one.
     """
 
     study: str
     trial: int | None
+    runs: Collection[str]
+    storage: str | None
 
 
 def target_of(run: Run) -> Target | None:
@@ -38,7 +43,9 @@ def target_of(run: Run) -> Target | None:
     number = tags.get(TRIAL_TAG)
     if number is not None and not number.isdecimal():
         raise TrackingError(f"run {run.info.run_id}: its tag {TRIAL_TAG} is {number[:50]!r}, but it must be a number")
-    return Target(tags[STUDY_TAG], None if number is None else int(number[:9]))
+    # The run of a trial's seed is a child of the trial's.
+    runs = {run.info.run_id, tags.get(PARENT_TAG, "")}
+    return Target(tags[STUDY_TAG], None if number is None else int(number[:9]), runs, tags.get(STORAGE_TAG))
 
 
 def interrupt(run: Run) -> str:

@@ -7,10 +7,11 @@ from collections.abc import Callable, Sequence
 
 from armscan.config.compose import compose_run
 from armscan.config.credentials import check_address
-from armscan.config.defaults import TRACKING_URI, to_plain
+from armscan.config.defaults import TRACKING_URI
 from armscan.errors import printable
 from armscan.launch.launchers import LAUNCHER, ON_THIS_MACHINE, check_launcher
 from armscan.sweeps.results.console import print_result
+from armscan.sweeps.scheduling.termination import reopen
 from armscan.sweeps.storage.storage import existing_storage
 from armscan.sweeps.study.arguments import STORAGE, StudyCommand, trial_overrides
 from armscan.sweeps.study.components import check_space, read_settings
@@ -18,8 +19,9 @@ from armscan.sweeps.study.final_eval import FinalEvaluation
 from armscan.sweeps.study.open import open_for_work
 from armscan.sweeps.study.plan import print_plan
 from armscan.sweeps.study.population import population_of
-from armscan.sweeps.study.study import existing_study
+from armscan.sweeps.study.study import existing_study, fixed_config
 from armscan.sweeps.study.warm_start import initial_trials
+from armscan.sweeps.tasks.attempt import volume_sums, volumes_of
 from armscan.sweeps.workers.launch import run_workers
 from armscan.utils.console import print_sentence
 from armscan.utils.log import silence_libraries
@@ -45,20 +47,24 @@ def run_study(arguments: Sequence[str], launch: Callable[[Sequence[str]], object
     population_of(settings, config)
     # Before the space is checked, which takes seconds, and before anything is created.
     storage = existing_storage(settings.storage)
-    existing = existing_study(storage, settings, to_plain(config))
+    volumes = volume_sums(volumes_of(config))
+    fixed = fixed_config(config, overrides, volumes)
+    existing = existing_study(storage, settings, fixed)
     if not given.is_plan:
         check_launcher(launcher)
     check_space(settings, task, overrides, config)
-    initial = initial_trials(settings, overrides, to_plain(config), existing)
+    initial = initial_trials(settings, overrides, fixed, existing)
     if given.is_plan:
         final = FinalEvaluation.stored(storage, existing) if storage is not None and existing is not None else None
         print_plan(settings, existing, final, initial)
         return 0
-    opened = open_for_work(settings, task, config, overrides)
+    opened = open_for_work(settings, task, config, overrides, volumes=volumes)
     search = opened.search.scheduler
     for each in initial:
         if each.add(search.storage, search.study):
             print_sentence(printable(each.message))
+    if reopen(search.study, search.storage, settings.asked):
+        print(f"{settings.name}: had ended by itself, going on")
     for phase in opened.phases:
         if phase.scheduler.resume():
             print(f"{phase.name}: was stopped, resuming")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import getpass
+from collections.abc import Collection
 from datetime import datetime
 
 import optuna
@@ -10,7 +11,7 @@ from optuna.exceptions import UpdateFinishedTrialError
 from optuna.trial import TrialState
 
 from armscan.errors import StudyError
-from armscan.sweeps.storage.attribute_names import LEASE, STOP
+from armscan.sweeps.storage.attribute_names import LEASE, RUN, STOP, STUDY_RUN
 from armscan.sweeps.storage.attributes import FINAL_SUFFIXES
 from armscan.sweeps.storage.storage import Storage, existing_storage, open_storage
 from armscan.sweeps.study.study import is_ours
@@ -27,6 +28,28 @@ def is_study(storage: Storage | None, name: str) -> bool:
     """Return whether a study of armscan has this name; the studies of its final trainings do not count."""
     study = storage.study(name) if storage is not None else None
     return study is not None and is_ours(study)
+
+
+def check_tracked(uri: str, name: str, number: int | None, *, runs: Collection[str], stored_in: str | None) -> None:
+    """Raise `StudyError` if a study or a trial has noted another run: a study elsewhere may have the same name.
+
+    Args:
+        uri: Storage that was given.
+        name: Name of the study.
+        number: Number of the trial; None for the study.
+        runs: Run IDs, one of which it must have noted, if it has noted any.
+        stored_in: Storage that the run names.
+    """
+    study = optuna.load_study(study_name=name, storage=_storage_with(uri, name).optuna)
+    noted = study.user_attrs.get(STUDY_RUN)
+    if number is not None:
+        trials = study.get_trials(deepcopy=False)
+        noted = trials[number].user_attrs.get(RUN) if number < len(trials) else None
+    if noted is not None and noted not in runs:
+        raise StudyError(
+            f"the study {name} in {uri!r} is not the one of this run, which is in {stored_in or 'another storage'}: "
+            "give that with --storage"
+        )
 
 
 def stop_study(uri: str, name: str) -> str:

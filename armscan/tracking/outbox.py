@@ -211,14 +211,18 @@ class Outbox(OutboxFile):
         text = json.dumps(self._uploaded)
         atomic_write(self._uploaded_file, lambda opened: opened.write(text.encode()))
 
-    def note(self) -> None:
-        """Write this machine's note of the run, so that the next start uploads what is left."""
+    def note(self, uri: str) -> None:
+        """Write this machine's note of the run, so that the next start uploads what is left.
+
+        Args:
+            uri: Address of the store that this process opened; the one in a stranger's outbox may be another.
+        """
         # Nothing is lost without the note: `armscan runs sync` finds the outbox.
         with contextlib.suppress(OSError):
             folder = cache_folder() / NOTES_FOLDER
             folder.mkdir(parents=True, exist_ok=True)
             forget(self.address.run_id)
-            Note(self.file.absolute(), self.address.uri, ProcessInfo.current()).write(folder / self.address.run_id)
+            Note(self.file.absolute(), uri, ProcessInfo.current()).write(folder / self.address.run_id)
 
     def close(self) -> None:
         """Close and unlock the outbox."""

@@ -53,7 +53,7 @@ class TrackedRun:
         self, store: TrackingStore, outbox: Outbox, *, name: str, logged: Collection[tuple[str, int]] = ()
     ) -> None:
         self._store, self._outbox = store, outbox
-        outbox.note()
+        outbox.note(store.uri)
         self._uploader = Uploader(outbox, store)
         self._logged = frozenset(logged)
         self._is_closed, self._is_uploaded, self._is_resumed = False, False, False
@@ -180,14 +180,20 @@ class TrackedRun:
             self._system.finish()
             self._system = None
 
-    def log_metrics(self, figures: Mapping[str, float], *, n_env_steps: int) -> None:
-        """Log metrics at an environment step, except NaN and those that an earlier process logged."""
+    def log_metrics(self, figures: Mapping[str, float], *, n_env_steps: int, keeps_nan: bool = False) -> None:
+        """Log metrics at an environment step, except NaN and those that an earlier process logged.
+
+        Args:
+            figures: Metrics by name.
+            n_env_steps: The environment step.
+            keeps_nan: Whether to log NaN, too, in place of values that are not valid any more. Default: False.
+        """
         at_ms = now_ms()
         points = [
             (name, float(value), at_ms, n_env_steps)
             for name, value in figures.items()
             # NaN is the mean over no episodes.
-            if value == value and (name, n_env_steps) not in self._logged
+            if (keeps_nan or value == value) and (name, n_env_steps) not in self._logged
         ]
         if points:
             self._add(metrics=points)

@@ -19,6 +19,7 @@ from armscan.tracking.store import absolute
 from armscan.tracking.tags import FAILURE_TAG, FOLDER_TAG
 from armscan.tracking.uploader import upload
 from armscan.utils.log import log
+from armscan.utils.processes import ProcessInfo
 
 # Statuses of a run that has ended, as its outbox holds them.
 ENDED = ("FINISHED", "FAILED", "KILLED")
@@ -168,14 +169,18 @@ def _upload_pending(store: TrackingStore) -> None:
             raise TrackingError(f"{uri} is another store")
         return store
 
+    here = ProcessInfo.current()
     for run_id, note in notes().items():
         is_there = note.outbox.exists()
         uploads = _synced([note.outbox], opened, trust=False)
         for each in uploads:
             if each.n_entries:
                 log(f"run {each.run_id}: uploaded {each.n_entries} entries that it had left")
-        # Also forget a removed run of another machine; a run that is in progress keeps its note.
-        if all(each.left is None for each in uploads) and (is_there or not note.process.is_here):
+        # A run in progress keeps its note. So does one of another machine that shares this cache, as its folder may
+        # be local to that machine. A process of an earlier boot has ended; an earlier version noted no process.
+        process = note.process
+        has_ended = not process.host or (process.host == here.host and process.boot != here.boot)
+        if all(each.left is None for each in uploads) and (is_there or has_ended):
             forget(run_id)
 
 
@@ -200,7 +205,7 @@ def abandon(folder: Path, store: TrackingStore, reason: str) -> None:
 def note_end(folder: Path, run_id: str, uri: str, status: str, tags: Mapping[str, str]) -> None:
     """Record a run's end in its outbox, for `sync` to upload, without contacting the store."""
     with contextlib.closing(Outbox.begin(folder, Address(run_id, absolute(uri)))) as outbox:
-        outbox.note()
+        outbox.note(absolute(uri))
         if tags:
             outbox.add(tags=tags_of(tags))
         outbox.add(status=(status, now_ms()))

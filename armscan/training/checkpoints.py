@@ -70,7 +70,7 @@ def resume_from_checkpoint(learner: Learner, folder: Path, provenance: Checkpoin
         The reports of the epochs so far, for `train`; none if there is no checkpoint yet.
 
     Raises:
-        CheckpointError: If a checkpoint is damaged or another run's, or the best one is missing.
+        CheckpointError: If a checkpoint is damaged or another run's, or the best one is missing or of another epoch.
         ChangedVolumesError: If a checkpoint is of other volumes.
     """
     last, best = folder / LAST_CHECKPOINT, folder / BEST_CHECKPOINT
@@ -85,10 +85,7 @@ def resume_from_checkpoint(learner: Learner, folder: Path, provenance: Checkpoin
     # Better refused now than after the training.
     best_facts = load_checkpoint(best)[1]
     provenance.check(best, best_facts)
-    if best_facts.get("epoch") != best_report.epoch:
-        raise CheckpointError(
-            f"{best}: is of epoch {best_facts.get('epoch')}, but the best epoch of {last} is {best_report.epoch}"
-        )
+    _check_best(folder, best_facts, best_report)
     return reports
 
 
@@ -108,17 +105,27 @@ def take_over_checkpoints(
         The reports of the other training's epochs, for `train`.
 
     Raises:
-        CheckpointError: If a checkpoint is missing, damaged or another run's.
+        CheckpointError: If a checkpoint is missing, damaged or another run's, or the best one is of another epoch.
         ChangedVolumesError: If a checkpoint is of other volumes.
     """
     weights, best_facts = load_checkpoint(source / BEST_CHECKPOINT)
     theirs.check(source / BEST_CHECKPOINT, best_facts)
     reports = _restore(learner, source / LAST_CHECKPOINT, theirs)
     best_report = best_of(reports)
+    _check_best(source, best_facts, best_report)
     save_checkpoint(folder / BEST_CHECKPOINT, weights, _facts(best_report, own))
     # Last, because from then on this training can be resumed.
     _save_last(learner, reports, folder, own)
     return reports
+
+
+def _check_best(folder: Path, best_facts: dict[str, Any], best_report: EpochReport) -> None:
+    """Raise `CheckpointError` if the best checkpoint is not of the best epoch that the last one reports."""
+    if (epoch := best_facts.get("epoch")) != best_report.epoch:
+        raise CheckpointError(
+            f"{folder / BEST_CHECKPOINT}: is of epoch {epoch}, but the best epoch of {folder / LAST_CHECKPOINT} is "
+            f"{best_report.epoch}"
+        )
 
 
 def _save_last(

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
+
+import numpy as np
 
 from armscan.errors import InvalidValueError
 from armscan.training.fingerprints import Fingerprints, fingerprint
@@ -54,15 +56,18 @@ class Split:
         self._check_copies()
 
     def _check_copies(self) -> None:
-        seen: dict[str, tuple[str, str]] = {}
-        for part, prints in self.fingerprints().items():
-            for name, each in prints.items():
-                other, its_part = seen.setdefault(each, (name, part))
-                if part != its_part:
-                    raise InvalidValueError(
-                        f"{name} ({part}) is a copy of {other} ({its_part}), but a wrist must be in one split: give "
-                        "both the same subject in the manifest, or remove one"
-                    )
+        # Not by fingerprint: a copy with another labelled plane is one, too.
+        seen: dict[Hashable, list[tuple[str, str, LabelVolume]]] = {}
+        for part, volumes in self.parts.items():
+            for name, volume in volumes.items():
+                similar = seen.setdefault(_sample(volume), [])
+                for other, its_part, its_volume in similar:
+                    if part != its_part and np.array_equal(volume.labels_yxz, its_volume.labels_yxz):
+                        raise InvalidValueError(
+                            f"{name} ({part}) is a copy of {other} ({its_part}), but a wrist must be in one split: "
+                            "give both the same subject in the manifest, or remove one"
+                        )
+                similar.append((name, part, volume))
 
     @property
     def parts(self) -> dict[str, dict[str, LabelVolume]]:
@@ -75,6 +80,11 @@ class Split:
             part: {name: fingerprint(volume) for name, volume in volumes.items()}
             for part, volumes in self.parts.items()
         }
+
+
+def _sample(volume: LabelVolume) -> Hashable:
+    """Return the spacing and a few voxels, the same in all copies: to compare every pair of volumes would take long."""
+    return volume.shape, volume.spacing, volume.labels_yxz[::16].tobytes()
 
 
 def phantom_data(

@@ -11,6 +11,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from secrets import token_hex
 from typing import BinaryIO
 
 import platformdirs
@@ -83,7 +84,7 @@ def atomic_write(path: Path, write: Callable[[BinaryIO], object], *, follow_link
     unfinished = _unfinished(path)
     try:
         with named_if_full(path):
-            with unfinished.open("wb") as file:
+            with unfinished.open("xb") as file:
                 write(file)
                 file.flush()
                 os.fsync(file.fileno())
@@ -136,12 +137,13 @@ def check_writable(path: Path) -> None:
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
     unfinished = _unfinished(path.resolve())
-    unfinished.touch()
+    unfinished.touch(exist_ok=False)
     unfinished.unlink()
 
 
 def _unfinished(path: Path) -> Path:
-    return path.with_name(f".{path.name}.{os.getpid()}.{UNFINISHED}")
+    # Random: in an untrusted folder, a link may lie at any name that could be predicted.
+    return path.with_name(f".{path.name}.{token_hex(4)}.{UNFINISHED}")
 
 
 def sha256(contents: bytes) -> str:

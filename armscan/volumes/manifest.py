@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import json
 import os
-import tempfile
 from collections.abc import Mapping
 from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import yaml
-from filelock import FileLock
+from filelock import AcquireReturnProxy, FileLock
 from ruamel.yaml import YAML
+from ruamel.yaml.comments import CommentedMap
 from yaml.representer import SafeRepresenter
 
 from armscan.errors import InvalidValueError, ManifestError, VolumeError, few, listed
-from armscan.utils.files import atomic_write, sha256
+from armscan.utils.files import atomic_write, cache_folder, sha256
 from armscan.utils.strict_yaml import check_no_duplicates, load_yaml
 from armscan.utils.validation import check_float, check_path
 from armscan.volumes.header_checks import CHECKS
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 MANIFEST_NAMES = ("manifest.yaml", "manifest.yml", "manifest.json", "optimal_actions.json")
 ENTRIES_ONLY = MANIFEST_NAMES[-1]
 NEW_MANIFEST = MANIFEST_NAMES[0]
+SUFFIXES = (".yaml", ".yml", ".json")
 
 Document = dict[str, Any]
 
@@ -48,10 +49,13 @@ def volume_files(folder: Path) -> dict[str, Path]:
 
 
 def find_manifest(folder: Path) -> Path | None:
-    """Return the one manifest of a folder, None if there is none."""
-    found = [folder / name for name in MANIFEST_NAMES if (folder / name).exists()]
+    """Return the one manifest of a folder, None if there is none; refuse a link that leads nowhere."""
+    # Such a link counts: to write a new manifest through it would make any file of this user.
+    found = [folder / name for name in MANIFEST_NAMES if os.path.lexists(folder / name)]
     if len(found) > 1:
         raise ManifestError(f"{folder}: holds {' and '.join(path.name for path in found)}, but one manifest is allowed")
+    if found and not found[0].exists():
+        raise ManifestError(f"{found[0]}: is a link to {str(found[0].readlink())!r}, but that file does not exist")
     return found[0] if found else None
 
 
@@ -91,7 +95,7 @@ def record_planes(folder: str | Path, planes: Mapping[str, tuple[ManipulatorActi
 
     Raises:
         InvalidValueError: If `planes` is not such a mapping, or a score is not in [-1, 0].
-        ManifestError: If the manifest is damaged, or the folder holds no such volume.
+        ManifestError: If the manifest is damaged or cannot be written, or the folder holds no such volume.
         VolumeError: If the folder cannot be used.
     """
     folder = check_path("the folder of volumes", folder)
@@ -99,10 +103,19 @@ def record_planes(folder: str | Path, planes: Mapping[str, tuple[ManipulatorActi
     files = volume_files(folder)
     if unknown := [name for name in recorded if name not in files]:
         raise ManifestError(f"{folder}: a plane is given for {few(unknown)}, but the folder holds {few(files)}")
-    # Concurrent writers would overwrite each other. The lock file lies elsewhere, so that none is left in the folder.
-    lock = Path(tempfile.gettempdir()) / f"armscan-{sha256(os.fsencode(folder.resolve()))[:16]}.lock"
-    with FileLock(lock):
+    with _locked(folder):
         return _recorded(folder, recorded, files)
+
+
+def _locked(folder: Path) -> AcquireReturnProxy:
+    """Lock a folder, and return the context that releases it: concurrent writers would overwrite each other."""
+    # It lies elsewhere, so that none is left in the folder, and other users of a shared cache may lock it, too.
+    path = cache_folder() / f"manifest-{sha256(os.fsencode(folder.resolve()))[:16]}.lock"
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return FileLock(path, mode=0o666).acquire()
+    except OSError as error:
+        raise ManifestError(f"{path}: the manifest of {folder} cannot be locked ({error.strerror or error})") from error
 
 
 def _recorded(folder: Path, recorded: dict[str, dict[str, Any]], files: dict[str, Path]) -> Path:
@@ -111,30 +124,45 @@ def _recorded(folder: Path, recorded: dict[str, dict[str, Any]], files: dict[str
 
     found = find_manifest(folder)
     path = found or folder / NEW_MANIFEST
+    target = path.resolve()
+    if target.suffix not in SUFFIXES:
+        raise ManifestError(f"{path}: is a link to {str(target)!r}, but a plane is written only to {listed(SUFFIXES)}")
     document = _load(path) if found else {}
     check_manifest(document, path)
+    entries = document.get("volumes")
+    entries = {name: {} for name in files} if entries is None else entries
+    entries = {**entries, **{name: {**entries.get(name, {}), **keys} for name, keys in recorded.items()}}
+    document = {**document, "volumes": entries}
     try:
-        if found and path.suffix != ".json":
-            document = _round_trip().load(path.read_text(encoding="utf-8-sig")) or {}
-        if document.get("volumes") is None:
-            document["volumes"] = {name: {} for name in files}
-        entries = document["volumes"]
-        for name, keys in recorded.items():
-            entry = entries.get(name, {})
-            # With YAML aliases two entries can be one object.
-            is_shared = any(other is entry for key, other in entries.items() if key != name)
-            entries[name] = dict(entry) if is_shared else entry
-            entries[name].update(keys)
-        text = StringIO()
         if path.suffix == ".json":
-            text.write(json.dumps(entries if path.name == ENTRIES_ONLY else document, indent=1) + "\n")
+            text = json.dumps(entries if path.name == ENTRIES_ONLY else document, indent=1) + "\n"
         else:
-            _round_trip().dump(document, text)
-        atomic_write(path, lambda file: file.write(text.getvalue().encode()), follow_link=True)
+            text = _edited(path.read_text(encoding="utf-8-sig") if found else "", recorded, document)
+        atomic_write(path, lambda file: file.write(text.encode()), follow_link=True)
     # ruamel.yaml refuses some odd texts that PyYAML reads, with exceptions of many types.
     except Exception as error:
         raise ManifestError(f"{path}: the manifest cannot be written ({error})") from error
     return path
+
+
+def _edited(text: str, recorded: dict[str, Document], wanted: Document) -> str:
+    """Return the text of a YAML manifest with recorded keys written into it; raise if it is not read as `wanted`."""
+    editor = _round_trip()
+    document = editor.load(text) or {}
+    if document.get("volumes") is None:
+        document["volumes"] = {name: {} for name in wanted["volumes"]}
+    entries = document["volumes"]
+    for name, keys in recorded.items():
+        entry = entries.get(name, {})
+        # Other entries may repeat one with an anchor: those stay as they are.
+        has_anchor = isinstance(entry, CommentedMap) and entry.anchor.value is not None
+        entries[name] = entry.copy() if has_anchor else entry
+        entries[name].update(keys)
+    edited = StringIO()
+    editor.dump(document, edited)
+    if load_yaml(edited.getvalue()) != wanted:
+        raise ValueError("its anchors, aliases or merged keys would change other values: write them out")
+    return edited.getvalue()
 
 
 def _checked_planes(planes: Any) -> dict[str, Document]:

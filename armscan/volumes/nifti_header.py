@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ LAYOUTS = {
         "type": ("h", 70),
         "steps": ("8f", 76),
         "begin": ("f", 108),
+        "sform_code": ("h", 254),
         "place": ("18f", 256),
     },
     540: {
@@ -33,6 +35,7 @@ LAYOUTS = {
         "type": ("h", 12),
         "steps": ("8d", 104),
         "begin": ("q", 168),
+        "sform_code": ("i", 348),
         "place": ("18d", 352),
     },
 }
@@ -40,10 +43,12 @@ MAGIC = (b"n+1\0", b"n+2\0\r\n\032\n")
 LONGEST_HEADER = 544
 # No header is longer, extensions included.
 MAX_OFFSET = 1 << 24
+# Between the spacings of the header and of the sform, both of which many programs round.
+SPACING_TOLERANCE = 1e-3
 
 
 def check_nifti(path: Path) -> None:
-    """Raise `VolumeError` if a NIfTI file is damaged, or its qform, its sform or a voxel is not finite."""
+    """Raise `VolumeError` if a NIfTI file is damaged or states two spacings, or a place or voxel is not finite."""
     compression = GZIP if path.suffix == ".gz" else None
     header = b""
     with path.open("rb") as file:
@@ -74,6 +79,8 @@ def check_nifti(path: Path) -> None:
     check_spacing(path, fields["steps"][1:4][:n_dimensions])
     if not all(map(math.isfinite, fields["place"])):
         raise VolumeError(f"{path}: its place in the world (qform, sform) holds a NaN or an infinity")
+    if fields["sform_code"][0] > 0:
+        _check_one_spacing(path, fields["steps"][1:4][:n_dimensions], fields["place"][6:])
     voxel = np.dtype(order + TYPES[code])
     check_stored(
         path,
@@ -85,3 +92,13 @@ def check_nifti(path: Path) -> None:
             finite=voxel.str if voxel.kind == "f" else None,
         ),
     )
+
+
+def _check_one_spacing(path: Path, steps: Sequence[float], sform: Sequence[float]) -> None:
+    """Raise `VolumeError` if the sform has another spacing than the header, by which SimpleITK goes."""
+    norms = np.linalg.norm(np.reshape(sform, (3, 4))[:, : len(steps)], axis=0)
+    if not np.allclose(norms, steps, rtol=SPACING_TOLERANCE, atol=0.0):
+        stated, other = (", ".join(f"{step:g}" for step in each) for each in (steps, norms))
+        raise VolumeError(
+            f"{path}: the spacing is ({stated}) by pixdim, but ({other}) by the sform: correct one of them"
+        )

@@ -37,6 +37,7 @@ CODE = (
     plane,
     volume,
 )
+READERS = ("SimpleITK", "slicerio", "pynrrd")
 # A text header that matches has its voxels in another file, or may have.
 ELSEWHERE = {
     "nrrd": re.compile(rb"(?im)^data ?file"),
@@ -105,7 +106,7 @@ def _place(kind: str, *depends_on: Any) -> Path:
 
 @cache
 def _code_version() -> str:
-    digest = hashlib.sha256(version("SimpleITK").encode())
+    digest = hashlib.sha256(repr([version(package) for package in READERS]).encode())
     for module in CODE:
         digest.update(Path(str(module.__file__)).read_bytes())
     return digest.hexdigest()

@@ -3,10 +3,7 @@
 import hashlib
 import math
 import os
-import subprocess
-import sys
 from copy import deepcopy
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,7 +18,8 @@ from armscan.agents import MLP, SAC, Compute, Multimodal
 from armscan.agents.compiled_sac import N_AT_ONCE, CompiledSAC
 from armscan.agents.replay import Replay
 from tests.agents.conftest import ENV_FACTORIES, SMALL_SAC, setup_for
-from tests.agents.test_learners import tensors
+from tests.support.programs import output_of
+from tests.support.tensors import assert_same_tensors, named_tensors
 
 # One worker compiles the update, which takes ten seconds, and the others find it on disk.
 pytestmark = pytest.mark.xdist_group("compiled_sac")
@@ -87,10 +85,7 @@ def updated(each, replay, n, *, batch_size=32, seed=1, at_once=1):
 
 
 def assert_same_state(one, other, tolerance):
-    parts, others = (tensors([each.state_dict(), entropy_state(each)]) for each in (one, other))
-    for part, its_like in zip(parts, others, strict=True):
-        assert part.dtype == its_like.dtype
-        torch.testing.assert_close(part, its_like, rtol=tolerance, atol=tolerance)
+    assert_same_tensors(*([each.state_dict(), entropy_state(each)] for each in (one, other)), tolerance)
 
 
 def differences(one, other):
@@ -187,8 +182,8 @@ print(digest(ours))
 
 
 def digest(each):
-    state = b"".join(part.numpy().tobytes() for part in tensors([each.state_dict(), entropy_state(each)]))
-    return hashlib.sha256(state).hexdigest()
+    state = named_tensors([each.state_dict(), entropy_state(each)]).values()
+    return hashlib.sha256(b"".join(part.numpy().tobytes() for part in state)).hexdigest()
 
 
 def test_updates_are_the_same_to_the_bit_on_any_number_of_threads():
@@ -196,15 +191,7 @@ def test_updates_are_the_same_to_the_bit_on_any_number_of_threads():
     digests = set()
     for n in ("1", "2"):
         limits = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), n)
-        said = subprocess.run(
-            [sys.executable, "-c", THREADS, n],
-            env=os.environ | limits,
-            cwd=Path(__file__).parents[2],
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout
-        digests.add(said.split()[-1])
+        digests.add(output_of(THREADS, n, **limits).split()[-1])
     assert len(digests) == 1
 
 

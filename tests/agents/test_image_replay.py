@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import torch
 from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
@@ -14,6 +13,7 @@ from armscan.agents.image_replay import ImageReplay, replay_for
 from armscan.agents.replay import Replay
 from armscan.envs import EnvFactory
 from armscan.training import load_checkpoint, save_checkpoint
+from tests.support.tensors import assert_same_tensors
 
 N_ENVS = 3
 RULES = {
@@ -213,17 +213,7 @@ def test_replay_goes_on_from_a_checkpoint_bit_for_bit(envs, tmp_path, n_steps):
             replay.add(batch)
         assert_frames_are_those_referred_to(other)
     assert_gives_the_same(other, plain)
-    states = [tensors(replay.state()) for replay in (image, other)]
-    assert states[0].keys() == states[1].keys()
-    assert all(torch.equal(tensor, states[1][name]) for name, tensor in states[0].items())
-
-
-def tensors(tree, name=""):
-    """Every tensor of nested dicts, by the names that lead to it."""
-    if isinstance(tree, torch.Tensor):
-        return {name: tree}
-    parts = tree.items() if isinstance(tree, dict) else ()
-    return {key: tensor for part, value in parts for key, tensor in tensors(value, f"{name}/{part}").items()}
+    assert_same_tensors(image.state(), other.state())
 
 
 def test_observations_without_images_have_a_plain_replay():

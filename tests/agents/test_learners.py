@@ -8,22 +8,9 @@ from armscan.agents import PPO, SAC, Learner, Regression
 from armscan.errors import CheckpointError, DivergedError, InvalidValueError
 from armscan.training import load_checkpoint, save_checkpoint
 from tests.agents.conftest import ALGORITHMS, ENV_FACTORIES, SMALL_SAC, setup_for
+from tests.support.tensors import assert_same_tensors, named_tensors
 
 by_reinforcement = pytest.mark.parametrize("algorithm", ["sac", "ppo"], indirect=True)
-
-
-def tensors(tree):
-    """Every tensor of nested dicts, by their sorted keys, and lists, in order."""
-    if isinstance(tree, torch.Tensor):
-        return [tree]
-    parts = (
-        [tree[key] for key in sorted(tree, key=str)]
-        if isinstance(tree, dict)
-        else tree
-        if isinstance(tree, list | tuple)
-        else []
-    )
-    return [tensor for part in parts for tensor in tensors(part)]
 
 
 def begun(learner, env, seed=0):
@@ -130,8 +117,8 @@ def test_learner_of_the_same_seed_learns_the_same(make_learner):
         learner = make_learner()
         learner.warm_up()
         learner.learn(20)
-        learned.append(tensors(learner.state()))
-    assert all(torch.equal(a, b) for a, b in zip(*learned, strict=True))
+        learned.append(learner.state())
+    assert_same_tensors(*learned)
 
 
 def test_learner_goes_on_from_a_checkpoint_bit_for_bit(make_learner, tmp_path):
@@ -147,9 +134,8 @@ def test_learner_goes_on_from_a_checkpoint_bit_for_bit(make_learner, tmp_path):
         each.learn(20)
         each.learn(20)
     assert learner.n_env_steps == other.n_env_steps
-    pairs = list(zip(tensors(learner.state()), tensors(other.state()), strict=True))
-    assert len(pairs) > 15
-    assert all(torch.equal(a, b) for a, b in pairs)
+    assert len(named_tensors(learner.state())) > 15
+    assert_same_tensors(learner.state(), other.state())
 
 
 def test_weights_bring_back_what_the_policy_did(make_learner, env):

@@ -1,20 +1,17 @@
 """Optuna as the searcher over the plane."""
 
 import logging
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 
 from armscan.agents import Learner, OptunaSearch, Random
 from armscan.agents.optuna_search import SAMPLERS
-from armscan.envs.actions import ActionBounds
 from armscan.errors import InvalidValueError
 from tests.agents.conftest import ENV_FACTORIES, setup_for
-
-BOUNDS = ActionBounds((90.0, 45.0), (97.2, 216.0))
-NAMES = ("rz", "rx", "tx", "ty")
+from tests.agents.test_baselines import BOUNDS
+from tests.agents.test_plane_finder import NAMES
+from tests.support.programs import imported_by
 
 
 def agent_of(algorithm, phantom, n_action):
@@ -90,8 +87,7 @@ def test_search_says_nothing(phantom, capfd):
 
 
 def test_optuna_is_loaded_only_where_it_searches():
-    program = "import sys, armscan.agents; sys.exit('optuna' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
+    assert "optuna" not in imported_by("import armscan.agents")
 
 
 @pytest.mark.parametrize(

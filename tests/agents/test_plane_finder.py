@@ -18,6 +18,7 @@ from armscan.training import evaluate
 from armscan.training.episodes import play
 from armscan.volumes import LabelVolume
 from tests.agents.conftest import setup_for
+from tests.support.tensors import assert_same_tensors
 
 SMALL = {"num_envs": 4, "filters": (2, 2, 2), "hidden_sizes": (16,)}
 NAMES = ("rz", "rx", "tx", "ty")
@@ -69,8 +70,7 @@ def test_learner_goes_on_from_its_state_to_the_bit(phantom):
     for learner in (one, other):
         learner.learn(24)
     assert one.n_env_steps == other.n_env_steps == 48
-    for name, weights in one.weights().items():
-        assert torch.equal(weights, other.weights()[name])
+    assert_same_tensors(one.weights(), other.weights())
 
 
 def test_looks_lie_beside_what_is_found_and_the_last_on_it(phantom):
@@ -88,8 +88,8 @@ def test_looks_lie_beside_what_is_found_and_the_last_on_it(phantom):
     np.testing.assert_allclose(planes[:, :2], 0.0, atol=1e-3)
 
 
-def answers_of(learner, env):
-    """Return the actions of a learner, of its policy, and of the program exported from that, for the same looks."""
+def assert_policy_answers(learner, env):
+    """Check that the policy, and the program exported from it, answer the same looks as the learner does."""
     observations = []
     for seed in range(3):
         observation, _ = env.reset(seed=seed)
@@ -99,16 +99,15 @@ def answers_of(learner, env):
     batch = batch_of(observations)
     actions = np.array([learner.act(observation, 0.0) for observation in observations])
     policy = learner.policy()
-    return actions, policy(batch), export_program(policy, batch).module()(batch)
+    for answers in (policy(batch), export_program(policy, batch).module()(batch)):
+        np.testing.assert_allclose(answers, actions, atol=1e-6)
 
 
 @pytest.mark.parametrize(("n_averaged", "average_tilts"), [(1, True), (2, True), (2, False)])
 def test_policy_answers_as_the_learner_does_also_exported(phantom, n_averaged, average_tilts):
     learner, env = made(phantom, n_averaged=n_averaged, average_tilts=average_tilts)
     learner.learn(24)
-    actions, of_policy, of_program = answers_of(learner, env)
-    np.testing.assert_allclose(of_policy, actions, atol=1e-6)
-    np.testing.assert_allclose(of_program, actions, atol=1e-6)
+    assert_policy_answers(learner, env)
     assert learner.policy().differs is None
 
 
@@ -268,4 +267,11 @@ def test_learner_computes_in_mixed_precision(phantom):
     env_factory = EnvFactory(**RULES)
     setup = setup_for(env_factory, phantom, action_names=NAMES, total_env_steps=480, compute=Compute("cpu", "bfloat16"))
     learner = PlaneFinder(**SMALL).agent(setup)
+    computed = []
+    learner._module.network.place.register_forward_hook(lambda _, inputs, output: computed.append(output.dtype))
     assert np.isfinite(learner.learn(24)["update/loss"])
+    n_taught = len(computed)
+    learner.act(env_factory.make_env([phantom]).reset(seed=0)[0], 0.0)
+    # Learning and acting alike.
+    assert 0 < n_taught < len(computed)
+    assert set(computed) == {torch.bfloat16}

@@ -7,23 +7,28 @@ import pytest
 import torch
 from hydra.errors import InstantiationException
 
-from armscan.agents import MLP, SAC, Learner, ResidualSAC
+from armscan.agents import MLP, SAC, Compute, Learner, ResidualSAC
 from armscan.agents.policy import batch_of
+from armscan.agents.torch_export import export_program
 from armscan.config.compose import compose
 from armscan.config.error_messages import one_line_message
 from armscan.envs import EnvFactory
 from armscan.errors import InvalidValueError
 from armscan.experiment.agent import make_algorithm
+from armscan.training import evaluate
+from armscan.training.episodes import play
 from tests.agents.conftest import SMALL_SAC, setup_for
-from tests.agents.test_plane_finder import NAMES, RULES, SMALL, answers_of, played
+from tests.agents.test_plane_finder import NAMES, RULES, SMALL, assert_policy_answers, played
+from tests.support.tensors import assert_same_tensors
 
 N_TAUGHT = 24
 
 
-def made(phantom, total_env_steps=200, rules=None, **changes):
+def made(phantom, total_env_steps=200, rules=None, precision="float32", **changes):
     env_factory = EnvFactory(**RULES | (rules or {}))
     names = (*NAMES, "stop") if (rules or {}).get("ends") == "on_stop" else NAMES
-    setup = setup_for(env_factory, phantom, action_names=names, total_env_steps=total_env_steps)
+    compute = Compute("cpu", precision)
+    setup = setup_for(env_factory, phantom, action_names=names, total_env_steps=total_env_steps, compute=compute)
     sac = SAC(network=MLP((8,)), **SMALL_SAC)
     learner = ResidualSAC(**SMALL | {"sac": sac, "pretraining_env_steps": N_TAUGHT} | changes).agent(setup)
     return learner, env_factory.make_env([phantom])
@@ -94,14 +99,35 @@ def test_learner_goes_on_from_its_state_to_the_bit(phantom, n_before):
     for learner in (one, other):
         learner.learn(40)
     assert one.n_env_steps == other.n_env_steps
-    for name, weights in one.weights().items():
-        assert torch.equal(weights, other.weights()[name])
+    assert_same_tensors(one.weights(), other.weights())
 
 
 def test_policy_answers_as_the_learner_does_also_exported(corrected):
-    actions, of_policy, of_program = answers_of(*corrected)
-    np.testing.assert_allclose(of_policy, actions, atol=1e-6)
-    np.testing.assert_allclose(of_program, actions, atol=1e-6)
+    assert_policy_answers(*corrected)
+
+
+def test_policy_of_mixed_precision_is_a_copy_in_32_bits_also_exported(phantom):
+    learner, env = made(phantom, precision="bfloat16")
+    for _ in range(2):
+        learner.learn(40)
+    policy, batch = learner.policy(), batch_of([env.reset(seed=seed)[0] for seed in range(2)])
+    actions = policy(batch)
+    np.testing.assert_allclose(export_program(policy, batch).module()(batch), actions, atol=1e-6)
+    learner.load_weights({name: torch.zeros_like(weights) for name, weights in learner.weights().items()})
+    assert torch.equal(policy(batch), actions)
+
+
+def test_errors_are_expected_of_planes_that_are_not_corrected(phantom):
+    learner, env = made(phantom)
+
+    def expected():
+        results = (play(learner, env, phantom.name, seed=3), *evaluate(learner, env, n_episodes=2, seed=3).episodes)
+        return [error for each in results for error in (each.expected_mm, each.expected_deg)]
+
+    learner.learn(N_TAUGHT)
+    assert min(expected()) > 0.0
+    learner.learn(40)
+    assert set(expected()) == {None}
 
 
 def test_learner_stops_where_its_plane_finder_does(phantom):
@@ -124,6 +150,10 @@ def test_learner_stops_where_its_plane_finder_does(phantom):
         ({"pretraining_env_steps": 3}, "look 12 times before the first gradient step"),
         ({"correction_mm": 0.0}, "agent.correction_mm is 0"),
         ({"sac": None}, "agent.sac is None"),
+        (
+            {"sac": SAC(network=MLP((8,)), **SMALL_SAC, deterministic_eval=False)},
+            "agent.sac.deterministic_eval is False, but it must be true",
+        ),
     ],
 )
 def test_impossible_parameters_are_refused(phantom, changes, message):

@@ -8,7 +8,7 @@ from armscan.agents.batch_agent import BatchAgent
 from armscan.agents.schedule import read_schedule
 from armscan.errors import InvalidValueError
 from tests.agents.conftest import ENV_FACTORIES, setup_for
-from tests.agents.test_learners import tensors
+from tests.support.tensors import assert_same_tensors
 
 # What changes after 40 environment steps, and after 60, by the name of the algorithm.
 CHANGES = {
@@ -40,11 +40,7 @@ def learned(learner, until):
         learner.warm_up()
     while learner.n_env_steps < until:
         learner.learn(20)
-    return tensors(learner.state())
-
-
-def are_equal(first, second):
-    return len(first) == len(second) and all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
+    return learner.state()
 
 
 def test_learner_with_a_schedule_is_a_learner_that_plays_side_by_side(make_scheduled):
@@ -65,13 +61,14 @@ def test_learner_with_a_schedule_goes_on_from_any_epoch_bit_for_bit(make_schedul
     second.load_state(first.state())
     # A restarted process draws other numbers in between.
     torch.rand(7)
-    assert are_equal(learned(whole, 120), learned(second, 120))
+    assert_same_tensors(learned(whole, 120), learned(second, 120))
 
 
 def test_learner_with_a_schedule_learns_otherwise_from_its_first_change_on(make_scheduled):
     scheduled, plain = make_scheduled(), make_scheduled(is_scheduled=False)
-    assert are_equal(learned(scheduled, 40), learned(plain, 40))
-    assert not are_equal(learned(scheduled, 80), learned(plain, 80))
+    assert_same_tensors(learned(scheduled, 40), learned(plain, 40))
+    with pytest.raises(AssertionError, match="not equal"):
+        assert_same_tensors(learned(scheduled, 80), learned(plain, 80))
 
 
 @pytest.mark.parametrize("algorithm", ["sac"], indirect=True)

@@ -7,12 +7,12 @@ import pytest
 import torch
 from tianshou.data import Batch, Collector, VectorReplayBuffer
 
-from armscan.agents import MLP, PPO, SAC, tianshou_learner
+from armscan.agents import MLP, PPO, SAC, Compute, tianshou_learner
 from armscan.agents.replay import Replay
 from armscan.agents.step_collector import StepCollector
 from armscan.envs import EnvFactory, SliceChannelsObservation
 from tests.agents.conftest import SMALL_MULTIMODAL, SMALL_PPO, SMALL_SAC, setup_for
-from tests.agents.test_learners import tensors
+from tests.support.tensors import assert_same_tensors
 
 OBSERVATIONS = {
     "vector": ({"max_steps": 7}, MLP((8,))),
@@ -23,6 +23,8 @@ OBSERVATIONS = {
     ),
 }
 MEASURED_S = ("collect_time", "collect_speed")
+# Tianshou's are too low for episodes that PPO's collections cut in two.
+LENGTHS = ("lens", "lens_stat")
 
 
 @pytest.fixture
@@ -31,7 +33,7 @@ def of_tianshou(monkeypatch):
 
     def switch():
         monkeypatch.setattr(
-            tianshou_learner, "StepCollector", lambda *arguments: Collector(*arguments, exploration_noise=True)
+            tianshou_learner, "StepCollector", lambda *arguments: Collector(*arguments[:3], exploration_noise=True)
         )
         monkeypatch.setattr(
             Replay, "add", lambda self, batch, buffer_ids=None: plain_add(self, Batch(batch), buffer_ids)
@@ -41,10 +43,11 @@ def of_tianshou(monkeypatch):
     return switch
 
 
-def make(kind, small, observed, phantom, **changes):
-    rules, network = OBSERVATIONS[observed]
-    env_factory = EnvFactory(projection="zy", success_threshold=0.5, **rules)
-    return kind(network=network, **small | changes).agent(setup_for(env_factory, phantom, total_env_steps=400))
+def make(kind, small, observed, phantom, rules=None, precision="float32", **changes):
+    known, network = OBSERVATIONS[observed]
+    env_factory = EnvFactory(**{"projection": "zy", "success_threshold": 0.5} | known | (rules or {}))
+    setup = setup_for(env_factory, phantom, total_env_steps=400, compute=Compute("cpu", precision))
+    return kind(network=network, **small | changes).agent(setup)
 
 
 def collected(learner):
@@ -66,10 +69,12 @@ def all_that_is_drawn(learner):
     ]
 
 
-def assert_same_stats(ours, theirs):
+def assert_same_stats(ours, theirs, left_out=()):
     assert len(ours) == len(theirs)
     for one, other in zip(ours, theirs, strict=True):
         for field in fields(other):
+            if field.name in left_out:
+                continue
             value, its_like = getattr(one, field.name), getattr(other, field.name)
             if field.name in MEASURED_S:
                 assert value > 0
@@ -78,12 +83,6 @@ def assert_same_stats(ours, theirs):
                 assert value.dtype == its_like.dtype
             else:
                 assert value == its_like
-
-
-def assert_same_tensors(ours, theirs):
-    for one, other in zip(ours, theirs, strict=True):
-        assert one.dtype == other.dtype
-        assert torch.equal(one, other)
 
 
 @pytest.mark.parametrize("num_envs", [1, 3])
@@ -106,13 +105,32 @@ def test_transitions_statistics_and_draws_are_those_of_tianshous_collector(
         for each in metrics:
             assert each.pop("speed/env_steps_per_s") > 0
             assert each.pop("speed/updates_per_s") > 0
+            if kind is PPO:
+                del each["train/length"], each["train/length_max"]
         # The generators of torch and NumPy are shared.
-        runs.append((stats, metrics, all_that_is_drawn(learner), tensors(learner.state())))
+        runs.append((stats, metrics, all_that_is_drawn(learner), learner.state()))
     (ours, *our_metrics_and_draws, our_state), (theirs, *their_metrics_and_draws, their_state) = runs
     assert sum(each.n_collected_episodes for each in theirs) > 3
-    assert_same_stats(ours, theirs)
+    assert_same_stats(ours, theirs, LENGTHS if kind is PPO else ())
     assert our_metrics_and_draws == their_metrics_and_draws
     assert_same_tensors(our_state, their_state)
+
+
+def test_episodes_that_collections_of_ppo_cut_in_two_count_in_full(phantom):
+    learner = make(PPO, SMALL_PPO, "vector", phantom, rules={"ends": "on_budget"})
+    metrics = learner.learn(100)
+    assert metrics["train/episodes"] == 14
+    assert metrics["train/length"] == metrics["train/length_max"] == 7
+
+
+def test_policy_that_collects_computes_in_the_precision_of_the_updates(phantom):
+    learner = make(SAC, SMALL_SAC, "vector", phantom, precision="bfloat16")
+    learner.warm_up()
+    observations = learner._collector._pre_collect_obs_RO
+    with torch.no_grad():
+        of_updates = learner.actor(observations)[0]
+        assert_same_tensors(learner._collector._means_and_spreads(observations), of_updates)
+        assert not torch.equal(learner.policy().actor(observations)[0][0], of_updates[0])
 
 
 def test_either_collector_goes_on_from_the_others_checkpoint(phantom, of_tianshou):
@@ -126,7 +144,7 @@ def test_either_collector_goes_on_from_the_others_checkpoint(phantom, of_tiansho
     for each in (resumed, theirs):
         each.load_state(kept)
         each.learn(40)
-        states.append(tensors(each.state()))
+        states.append(each.state())
     assert_same_tensors(*states)
 
 

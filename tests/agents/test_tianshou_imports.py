@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
+from tests.support.programs import output_of
 
 PROGRAM = """
 import sys
@@ -18,5 +17,4 @@ print(Figure.__module__, SummaryWriter.__module__)
 
 def test_packages_are_not_imported_with_tianshou_and_can_be_imported_afterwards() -> None:
     """In its own process: here, other tests have imported them."""
-    printed = subprocess.run([sys.executable, "-c", PROGRAM], check=True, capture_output=True, text=True).stdout
-    assert printed.splitlines() == ["[]", "matplotlib.figure torch.utils.tensorboard.writer"]
+    assert output_of(PROGRAM).splitlines() == ["[]", "matplotlib.figure torch.utils.tensorboard.writer"]

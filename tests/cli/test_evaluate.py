@@ -1,26 +1,11 @@
 """The arguments of `armscan evaluate`."""
 
-from functools import partial
-
-import pytest
-
+from tests.support.refusals import assert_refused
 from tests.support.tracked_runs import FEW, store_of, tracked
 from tests.test_run import runs_in
 
 
-@pytest.fixture(autouse=True)
-def tracking_database(database):
-    """Give each test a database that has MLflow's tables already."""
-
-
-@pytest.fixture
-def answer(armscan, monkeypatch):
-    """Run `armscan evaluate` in this process; return its exit code and what it printed."""
-    monkeypatch.setenv("COLUMNS", "200")
-    return partial(armscan, "evaluate")
-
-
-def test_evaluate_answers_mistakes_in_one_line(answer, tmp_path, data_folder):
+def test_evaluate_answers_mistakes_in_one_line(evaluate, tmp_path, data_folder):
     run_id = tracked(tmp_path)
     (tmp_path / "a.json").mkdir()
     words_and_lines = [
@@ -61,7 +46,10 @@ def test_evaluate_answers_mistakes_in_one_line(answer, tmp_path, data_folder):
             ["--agent=random", "+tracking.uri=x"],
             "tracking.uri cannot be set here: give --tracking URI",
         ),
-        (["--agent=random", "tracking.artifacts=x"], "tracking.artifacts cannot be set here: see armscan evaluate --help"),
+        (
+            ["--agent=random", "tracking.artifacts=x"],
+            "tracking.artifacts cannot be set here: see armscan evaluate --help",
+        ),
         (
             ["--agent=random", "evaluation.episodes=5", "--episodes=2"],
             "evaluation.episodes cannot be set here: give --episodes NUMBER",
@@ -99,15 +87,12 @@ def test_evaluate_answers_mistakes_in_one_line(answer, tmp_path, data_folder):
         (["--agent=sac", "nonsense"], "'nonsense' cannot be read"),
     ]
     for words, line in words_and_lines:
-        code, _, errors = answer(*words)
-        assert code == 2, words
-        assert errors.startswith(f"error: {line}"), (words, errors)
-        assert len(errors.splitlines()) == 1, errors
-    assert not (tmp_path / "evaluations").exists() or not list((tmp_path / "evaluations").iterdir())
+        assert_refused(evaluate(*words), line)
+    assert not list(tmp_path.glob("evaluations/*"))
     assert len(runs_in(tmp_path)[1]) == 1
 
 
-def test_video_answers_mistakes_in_one_line(answer, tmp_path):
+def test_video_answers_mistakes_in_one_line(evaluate, tmp_path):
     run_id = tracked(tmp_path)
     client = store_of(tmp_path)
     experiment_id = client.get_run(run_id).info.experiment_id
@@ -131,9 +116,6 @@ def test_video_answers_mistakes_in_one_line(answer, tmp_path):
         ([run, "--out=/proc/videos"], "--out is '/proc/videos', but no video can be written there: "),
         ([run, "--success-threshold=7"], "Invalid value for '--success-threshold': 7.0 is not in the range 0<x<=1."),
     ):
-        code, _, errors = answer("--video", *words)
-        assert code == 2, words
-        assert errors.startswith(f"error: {line}"), (words, errors)
-        assert len(errors.splitlines()) == 1, errors
+        assert_refused(evaluate("--video", *words), line)
     assert not (tmp_path / "videos").exists()
     assert (tmp_path / "file").read_text() == "mine"

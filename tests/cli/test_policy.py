@@ -14,6 +14,7 @@ from armscan.runs.model_card import MAX_CHARS
 from armscan.tracking.tags import EVALUATED_TAG
 from armscan.training import load_checkpoint, save_checkpoint
 from armscan.utils.files import BEST_CHECKPOINT
+from tests.support.refusals import assert_refused
 from tests.support.tracked_runs import GUESSER, IMAGES, store_of, tracked
 from tests.test_run import runs_in
 from tests.training.test_train import evaluation_of
@@ -138,9 +139,7 @@ def test_bad_words_are_answered_in_one_line_and_change_nothing(answer, tmp_path)
         (["register", "0" * 32, name], f"the run is '{'0' * 32}', but no run of"),
     ]
     for words, line in words_and_lines:
-        code, _, errors = answer(*words)
-        assert (code, len(errors.splitlines())) == (2, 1), (words, errors)
-        assert errors.startswith(f"error: {line}"), (words, errors)
+        assert_refused(answer(*words), line)
     assert sorted(path.name for path in tmp_path.iterdir()) == before
     assert store_of(tmp_path).search_registered_models() == []
     assert "policy" not in {file.path for file in store_of(tmp_path).list_artifacts(run_id)}
@@ -154,11 +153,11 @@ def test_run_without_a_policy_is_refused(answer, tmp_path):
     lines = {
         baseline: f"run is '{baseline}', but its agent does not learn and has no policy",
         evaluation: f"run is '{evaluation}', but that is an evaluation, of {baseline}",
-        unfinished: f"run {unfinished} has kept no checkpoint",
+        unfinished: f"run {unfinished} stored no checkpoint",
     }
     for words in EXPORT, REGISTER:
         for run_id, line in lines.items():
-            assert answer(*words, run_id, "--trust")[2].startswith(f"error: {line}")
+            assert_refused(answer(*words, run_id, "--trust"), line)
     assert not (tmp_path / "new").exists()
     assert store_of(tmp_path).search_registered_models() == []
 
@@ -176,10 +175,10 @@ def test_damaged_checkpoint_is_told_and_changes_nothing(answer, tmp_path):
     for line, contents in damages.items():
         file.write_bytes(contents)
         client.log_artifact(run_id, str(file))
-        assert answer(*EXPORT, run_id)[2].startswith(f"error: run {run_id}: {line}")
+        assert_refused(answer(*EXPORT, run_id), f"run {run_id}: {line}")
     save_checkpoint(file, {"other": next(iter(weights.values()))}, facts)
     client.log_artifact(run_id, str(file))
-    assert answer(*REGISTER, run_id)[2].startswith(f"error: run {run_id}: the checkpoint is another agent's")
+    assert_refused(answer(*REGISTER, run_id), f"run {run_id}: the checkpoint is another agent's")
     assert not (tmp_path / "new").exists()
     assert client.search_registered_models() == []
     assert "policy" not in {file.path for file in client.list_artifacts(run_id)}
@@ -231,10 +230,8 @@ def test_model_that_does_not_answer_is_not_registered_and_only_one_line_told(ans
     program = model / "policy.onnx"
     program.write_bytes(program.read_bytes()[:1000])
     store_of(tmp_path).set_tag(run_id, SUM_TAG, model_sha256(model))
-    code, _, errors = answer("register", run_id, "--name=n")
-    assert code == 2
-    assert errors.startswith(f"error: run {run_id}: its policy/ is damaged, it does not answer its own example: ")
-    assert len(errors.splitlines()) == 1
+    line = f"run {run_id}: its policy/ is damaged, it does not answer its own example: "
+    assert_refused(answer("register", run_id, "--name=n"), line)
     assert len(versions_in(tmp_path)) == 1
 
 
@@ -259,11 +256,10 @@ def test_policy_is_not_registered_with_a_damaged_evaluation(answer, tmp_path):
 def test_policy_is_not_registered_where_artifacts_are_read_only(answer, tmp_path, made_read_only, part, beginning):
     run_id = tracked(tmp_path)
     with made_read_only(tmp_path / "artifacts" / part.format(run_id=run_id)):
-        code, printed, errors = answer("register", run_id, "--name=n")
-    assert (code, printed) == (2, "")
-    assert errors.startswith(f"error: {beginning}{tmp_path}/")
-    assert errors.endswith(": Read-only file system")
-    assert len(errors.splitlines()) == 1
+        refused = answer("register", run_id, "--name=n")
+    assert_refused(refused, f"{beginning}{tmp_path}/")
+    assert refused[1] == ""
+    assert refused[2].endswith(": Read-only file system")
     client = store_of(tmp_path)
     assert client.search_registered_models() == []
     assert not {"policy", SUM_TAG} & client.get_run(run_id).data.tags.keys()

@@ -6,7 +6,7 @@ import optuna
 import pytest
 
 from armscan.sweeps.storage.storage import open_storage
-from armscan.tracking import open_store
+from tests.support.stores import store_in
 
 
 @pytest.fixture
@@ -31,8 +31,7 @@ def run_with(tmp_path):
     """Make a run with tags; return its ID."""
 
     def make(status=None, **tags):
-        settings = {"experiment": "a", "artifacts": str(tmp_path / "artifacts"), "wait_s": 10.0}
-        client, experiment_id = open_store(f"sqlite:///{tmp_path}/mlruns.db", **settings)
+        client, experiment_id = store_in(tmp_path, "a")
         run_id = client.create_run(experiment_id, name="any", tags=tags).info.run_id
         if status:
             client.set_terminated(run_id, status)
@@ -78,6 +77,19 @@ def test_what_cannot_be_stopped_is_said_in_one_line(answer, study, run_with, tag
     run_id = run_with(**tags)
     assert answer(run_id) == (2, "", f"error: {line.format(run_id)}")
     assert stops_of(study) == (["", ""], "")
+
+
+def test_study_of_the_same_name_in_another_storage_is_not_stopped(answer, study, run_with):
+    study.set_user_attr("mlflow_run", "0" * 32)
+    study._storage.set_trial_user_attr(study.get_trials()[0]._trial_id, "mlflow_run", "1" * 32)
+    tags = {"study": "a", "study.storage": "postgresql://me@elsewhere/db"}
+    line = "error: the study a in 'optuna.journal' is not the one of this run, which is in postgresql://me@elsewhere/db"
+    for more in ({}, {"trial": "0"}):
+        assert answer(run_with(**tags, **more)) == (2, "", f"{line}: give that with --storage")
+    assert stops_of(study) == (["", ""], "")
+    # The run of one of the trial's seeds.
+    assert answer(run_with(**tags, trial="0", **{"mlflow.parentRunId": "1" * 32}))[0] == 0
+    assert stops_of(study)[0][0]
 
 
 def test_run_that_has_ended_is_not_interrupted(answer, run_with):

@@ -1,5 +1,6 @@
 """Runs made by a stranger: no command executes what they name."""
 
+import contextlib
 import json
 import re
 import shlex
@@ -11,10 +12,12 @@ from armscan.errors import ResumeError, UntrustedError
 from armscan.experiment.resume import resume
 from armscan.policies.build import SUM_TAG
 from armscan.policies.model import CODE, model_sha256
-from armscan.tracking import open_store
+from armscan.tracking.outbox import Address, Outbox
 from armscan.tracking.tags import DOMAIN_TAG, GRID_TAG, VERSION_TAG
 from armscan.utils.files import CONFIG_FILE, SHA256_TAGS, VOLUMES_FILE, sha256
 from tests.cli.test_policy import registered
+from tests.support.refusals import assert_refused
+from tests.support.stores import store_in
 from tests.support.tracked_runs import GUESSER, store_of, tracked
 
 # Targets in libraries that are always installed; Hydra would call each without asking.
@@ -64,11 +67,9 @@ def test_no_command_executes_what_a_run_names(armscan, tmp_path, door, section):
     run_id = run_with(tmp_path, **{section: DOORS[door](str(marker))})
     line = f"run {run_id}: its configuration builds {section}"
     for name in COMMANDS:
-        code, _, errors = answered(armscan, name, run_id)
-        assert code == 2, name
-        assert errors.startswith(f"error: {line}"), name
-        assert "--trust" in errors
-        assert len(errors.splitlines()) == 1
+        refused = answered(armscan, name, run_id)
+        assert_refused(refused, line)
+        assert "--trust" in refused[2]
         assert not marker.exists(), name
     store_of(tmp_path).set_terminated(run_id, "KILLED")
     with pytest.raises(UntrustedError, match=line):
@@ -148,15 +149,31 @@ def test_grid_of_another_folder_is_not_resumed(tmp_path, monkeypatch):
     with pytest.raises(UntrustedError, match=f"run {run_id}: it was started in {tmp_path}, whose configuration could"):
         resume([f"resume={run_id}"], list)
     repeated = []
-    resume([f"resume={run_id}", "--trust"], repeated.extend)
-    assert repeated == ["seed=1,2"]
+    resume([f"resume={run_id}", "--trust"], lambda *words, **trust: repeated.extend((*words, trust)))
+    assert repeated == [["seed=1,2"], run_id, {"trust": True}]
+
+
+def test_server_that_only_a_folder_names_is_sent_nothing(armscan, tmp_path, monkeypatch):
+    uri = "postgresql://me@elsewhere/db"
+    outbox = Outbox.begin(tmp_path / "theirs", Address("0" * 32, uri))
+    outbox.add(tags={"a": "b"})
+    outbox.close()
+    opened = []
+    monkeypatch.setattr("armscan.tracking.store._store", lambda uri, **_: opened.append(uri))
+    code, printed, _ = armscan("runs", "sync", "theirs")
+    assert code == 1
+    assert f"{uri} is not a store that this user has used here" in printed
+    assert not opened
+    # A stranger's outbox does not decide which stores are this user's.
+    with contextlib.closing(Outbox(outbox.file)) as mine:
+        mine.note("sqlite:///mlruns.db")
+    assert "is not a store that this user has used here" in armscan("runs", "sync", "theirs")[1]
+    assert not opened
 
 
 def grid_in(folder, words):
     """Track the parent of a grid that was started in a folder."""
-    client, experiment_id = open_store(
-        f"sqlite:///{folder}/mlruns.db", experiment="armscan", artifacts=str(folder / "artifacts"), wait_s=60.0
-    )
+    client, experiment_id = store_in(folder, "armscan")
     tags = {GRID_TAG: json.dumps(words), "working_folder": str(folder)}
     return client.create_run(experiment_id, name="grid", tags=tags).info.run_id
 
@@ -182,6 +199,9 @@ def test_commands_that_are_suggested_for_a_run_with_a_class_of_ones_own_can_be_t
     suggested = [line for line in printed.splitlines() if line.startswith(("evaluate", "record"))]
     assert len(suggested) == 2
     assert all(line.endswith(" --trust") for line in suggested)
-    client.log_param(tracked(tmp_path), "agent._target_", "armscan.agents.sac.SAC")
-    code, printed, _ = armscan("runs", "show", tracked(tmp_path))
+    run_id = tracked(tmp_path)
+    client.log_param(run_id, "agent._target_", "armscan.agents.SAC")
+    code, printed, _ = armscan("runs", "show", run_id)
+    assert code == 0
+    assert f"armscan evaluate {run_id}\n" in printed
     assert "--trust" not in printed

@@ -6,7 +6,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -20,17 +19,17 @@ from optuna.trial import FrozenTrial, TrialState
 from armscan.config.credentials import STORAGE_PASSWORD
 from armscan.sweeps.storage.attribute_names import LEASE, RETRY_OF
 from armscan.sweeps.storage.storage import open_storage
+from tests.support import FEW_VOLUMES, REPOSITORY
 from tests.support.postgres import PASSWORD
+from tests.support.processes import start_run
 from tests.support.waiting import HANG_S, wait_until
 
-REPOSITORY = Path(__file__).parents[2]
 # The user's own files, in the working folder of the command: a worker that does not find them fails every trial.
 OWN_FILES = {
     "sweeps/own.yaml": "# @package _global_\ndefaults: [sac_y, _self_]\nstudy: {max_retries: 3}\n",
     "conf/network/own.yaml": "defaults: [auto, _self_]\nvector: {hidden_sizes: [16]}\n",
 }
 OWN = ["sweep=own", "network=own"]
-FEW_VOLUMES = ["data.n_training=1", "data.n_validation=1", "data.n_test=1"]
 # Trials that only wait, each one to five seconds.
 WAITING = [
     *(
@@ -76,15 +75,7 @@ class StartedStudy:
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_text(text)
         self.printed = folder / "printed"
-        with self.printed.open("ab") as printed:
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "armscan.run", "-m", *words, *kept],
-                cwd=folder,
-                env=os.environ | own | environment,
-                stdout=printed,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
-            )
+        self.process = start_run("-m", *words, *kept, cwd=folder, environment={**own, **environment})
 
     @property
     def workers_folder(self) -> Path:

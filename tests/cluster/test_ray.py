@@ -3,7 +3,8 @@
 import pytest
 
 from armscan.config.credentials import STORAGE_PASSWORD
-from tests.cluster.studies import REPOSITORY, TRAINING, WAITING
+from tests.cluster.studies import TRAINING, WAITING
+from tests.support import REPOSITORY
 from tests.support.mlflow_server import mlflow_server
 from tests.support.postgres import PASSWORD, postgres_server
 from tests.support.ray_cluster import ray_cluster, why_not_here

@@ -8,6 +8,7 @@ from armscan.config.compose import compose
 from armscan.config.sources import config_folder
 from armscan.experiment.build import build_experiment
 from tests.conftest import DATA
+from tests.support import FEW_VOLUMES
 
 
 def choices(group):
@@ -45,7 +46,7 @@ BESIDE = {
 def test_conf_composes_every_agent_and_experiment(override):
     # Few phantoms, whatever an experiment says, so that this is quick. The threshold is loose, because a reward that is
     # fitted to one wrist alone would not accept the labelled plane of another.
-    few = ["data.n_training=1", "data.n_validation=1", "data.n_test=1", "env.success_threshold=0.5"]
+    few = [*FEW_VOLUMES, "env.success_threshold=0.5"]
     experiment = build_experiment(compose([override, *BESIDE.get(override, []), *few]))
     env = experiment.env_factory.make_env(experiment.split.test)
     observation, info = env.reset(seed=0)

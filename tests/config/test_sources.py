@@ -1,15 +1,13 @@
 """The user's configurations in the working folder, which come before armscan's own."""
 
-from pathlib import Path
-
 import pytest
 from hydra.errors import MissingConfigException
 
 from armscan.config.compose import compose
 from armscan.config.defaults import default_tracking
 from armscan.config.sources import own_folders, sweeps_folder, working_folder
+from tests.support import REPOSITORY
 
-REPOSITORY = Path(__file__).parents[2]
 MINE = "# @package _global_\n# One of my own.\ndefaults:\n  - /study/base\n  - _self_\nstudy:\n  name: mine\n"
 
 

@@ -11,6 +11,7 @@ from omegaconf import OmegaConf
 from armscan.config.compose import compose
 from armscan.config.defaults import to_plain
 from armscan.config.trust import (
+    check_composed,
     check_stored_address,
     check_stored_words,
     offered_classes,
@@ -88,6 +89,20 @@ def test_offered_classes_are_of_runs_and_not_of_commands():
         "tracking.uri=sqlite:///mlruns.db,http://elsewhere",
         "+cluster.tracking_uri=http://elsewhere",
         "+cluster={tracking_uri: http://elsewhere}",
+        # Hydra would compose these files, wherever they lie.
+        "experiment=../../elsewhere",
+        "experiment=best_y,../elsewhere",
+        "experiment=[best_y,../elsewhere]",
+        "experiment='../elsewhere'",
+        "++experiment=str(../elsewhere)",
+        "experiment=glob(../*)",
+        "experiment=mine/../../elsewhere",
+        r"experiment=.\./elsewhere",
+        "+obs@env.other=../elsewhere",
+        "+study/sampler=../elsewhere",
+        "sweep=/elsewhere",
+        'sweep="/elsewhere"',
+        "sweep=sac_y, /elsewhere",
     ],
 )
 def test_stored_command_line_that_could_execute_code_is_refused(word):
@@ -101,19 +116,27 @@ def test_stored_command_line_of_a_usual_grid_is_accepted():
         "agent.lr=0.1,0.2",
         f"tracking.uri={STORE}",
         "tracking.experiment=mine",
-        "data.path=/x",
+        "data.path=/x,../y",
+        "experiment=best_y,mine/best",
     ]
     assert untrusted_word(words, STORE) is None
     for uri in ("sqlite:///mlruns.db", "'sqlite:///mlruns.db'", f"'{STORE}'"):
         assert untrusted_word([f"tracking.uri={uri}"], STORE) is None
 
 
-@pytest.mark.parametrize("secret", ["MLFLOW_TRACKING_PASSWORD", "MLFLOW_TRACKING_TOKEN"])
-def test_password_is_sent_to_no_address_that_a_folder_names(monkeypatch, secret):
-    check_stored_address("http://elsewhere:5000")
-    monkeypatch.setenv(secret, "secret")
-    with pytest.raises(UntrustedError, match=f"http://elsewhere:5000 would be sent this user's {secret}"):
-        check_stored_address("http://elsewhere:5000")
-    check_stored_address("sqlite:////mlruns.db")
-    monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://elsewhere:5000")
-    check_stored_address("http://elsewhere:5000")
+def test_composed_configuration_builds_what_a_file_here_names_and_nothing_else(tmp_path, monkeypatch):
+    (tmp_path / "conf/agent").mkdir(parents=True)
+    (tmp_path / "conf/agent/mine.yaml").write_text("_target_: 'mine.Agent'")
+    monkeypatch.chdir(tmp_path)
+    config = default_config()
+    check_composed(config | {"agent": {"_target_": "mine.Agent"}}, where="job 1")
+    with pytest.raises(UntrustedError, match=r"job 1: its configuration builds agent by 'joblib.load'"):
+        check_composed(config | {"agent": {"_target_": "joblib.load"}}, where="job 1")
+
+
+@pytest.mark.parametrize("uri", ["http://elsewhere:5000", "postgresql://me@elsewhere/db", "mysql://elsewhere/db"])
+def test_password_is_sent_to_no_server_that_a_folder_names(uri):
+    with pytest.raises(UntrustedError, match=f"could be sent this user's passwords: give --tracking {uri}"):
+        check_stored_address(uri, {STORE})
+    check_stored_address(uri, {STORE, uri})
+    check_stored_address("sqlite:////mlruns.db", {STORE})

@@ -8,14 +8,15 @@ import re
 import shlex
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from tests.docker.files import REPOSITORY, read_compose, read_image
+from tests.docker.files import read_compose, read_image
+from tests.support import REPOSITORY
+from tests.support.ports import LOOPBACK, free_port
 from tests.support.waiting import wait_until
 
 STOP_S, SECRETS = 20.0, "/run/secrets"
@@ -41,7 +42,7 @@ class Containers:
         self.services: dict[str, dict[str, Any]] = read_compose(**given)["services"]
         self.folder, self._image, self._programs = folder, read_image(), programs
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
-        self.ports = {name: _free_port() for name, each in self.services.items() if "ports" in each}
+        self.ports = {name: free_port() for name, each in self.services.items() if "ports" in each}
         self.ports["postgres"] = postgres_port
         self.secret = folder / "secrets" / "database_password"
         for each in ("secrets", "programs", "home"):
@@ -54,11 +55,11 @@ class Containers:
 
     def _addresses(self) -> dict[str, str]:
         """Return patterns of the addresses in the files, with their replacements here."""
-        replaced = {r"\b0\.0\.0\.0\b": "127.0.0.1"}
+        replaced = {r"\b0\.0\.0\.0\b": LOOPBACK}
         for name, service in self.services.items():
             for port in service.get("ports", []):
                 inside = port.rpartition(":")[2]
-                replaced[rf"(?<=[@/]){name}:{inside}\b"] = f"127.0.0.1:{self.ports[name]}"
+                replaced[rf"(?<=[@/]){name}:{inside}\b"] = f"{LOOPBACK}:{self.ports[name]}"
                 replaced[rf"\b{inside}\b"] = str(self.ports[name])
         return replaced
 
@@ -169,9 +170,3 @@ def _end(process: subprocess.Popen[bytes]) -> None:
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)
     process.wait()
-
-
-def _free_port() -> int:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return int(free.getsockname()[1])

@@ -11,7 +11,8 @@ from typing import Any
 
 import yaml
 
-REPOSITORY = Path(__file__).parents[2]
+from tests.support import REPOSITORY
+
 FOLDER = REPOSITORY / "docker"
 COMPOSE, CUDA, WORKERS = FOLDER / "compose.yaml", FOLDER / "compose.cuda.yaml", FOLDER / "kubernetes" / "workers.yaml"
 # The forms in use: ${NAME:-default}, whose default also replaces an empty value, and ${NAME-default}.

@@ -16,7 +16,8 @@ from pathlib import Path
 import psutil
 
 from tests.docker.containers import SECRETS, Containers
-from tests.docker.files import FOLDER, REPOSITORY, instructions
+from tests.docker.files import FOLDER, instructions
+from tests.support import REPOSITORY
 from tests.support.requirements import unavailable
 
 PROGRAMS = ("buildah", "debootstrap")

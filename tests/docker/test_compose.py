@@ -8,7 +8,8 @@ import pytest
 import yaml
 
 from tests.conftest import DATA
-from tests.docker.files import COMPOSE, CUDA, FOLDER, REPOSITORY, read_compose, read_image, variables_of
+from tests.docker.files import COMPOSE, CUDA, FOLDER, read_compose, read_image, variables_of
+from tests.support import REPOSITORY
 
 SERVICES = ("postgres", "mlflow", "dashboard", "worker")
 

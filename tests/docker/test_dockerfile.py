@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.docker.files import FOLDER, REPOSITORY, instructions, read_image
+from tests.docker.files import FOLDER, instructions, read_image
+from tests.support import REPOSITORY
 
 
 def test_hadolint_finds_nothing_and_ignores_nothing():

@@ -2,8 +2,6 @@
 
 import copy
 import json
-import subprocess
-import sys
 
 import gymnasium as gym
 import numpy as np
@@ -14,6 +12,7 @@ from armscan.anatomy import METRIC_TISSUES, AgreementReward, LandmarkReward, Sca
 from armscan.envs import ArmscanEnv, ClusterObservation, ManipulatorAction, RandomTransform
 from armscan.errors import InvalidValueError, ManifestError, OptimalPlaneError, ResetNeededError, VolumeError
 from armscan.volumes import LabelVolume
+from tests.support.programs import imported_by, output_of
 
 
 @pytest.fixture
@@ -59,8 +58,7 @@ def test_env_with_the_same_seed_plays_the_same_episode_in_another_process(env):
         "from tests.envs.test_env import play\n"
         "print(json.dumps(play(ArmscanEnv([load_phantom(0)]), 5, 5), default=bool))"
     )
-    answer = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    assert json.loads(answer.stdout) == json.loads(json.dumps(play(env, 5, 5), default=bool))
+    assert json.loads(output_of(script)) == json.loads(json.dumps(play(env, 5, 5), default=bool))
 
 
 def test_env_terminates_above_minus_delta_at_the_optimum(phantom):
@@ -262,12 +260,8 @@ def test_env_passes_on_what_is_wrong_with_a_folder(tmp_path, write_labelmap):
 
 
 def test_importing_the_environment_loads_no_training_library():
-    script = (
-        "import sys, armscan, armscan.envs, armscan.anatomy, armscan.volumes\n"
-        "print([name for name in ('torch', 'tianshou', 'hydra', 'mlflow', 'optuna') if name in sys.modules])"
-    )
-    answer = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    assert answer.stdout.strip() == "[]"
+    loaded = imported_by("import armscan, armscan.envs, armscan.anatomy, armscan.volumes")
+    assert not loaded & {"torch", "tianshou", "hydra", "mlflow", "optuna"}
 
 
 def test_transform_about_the_first_voxel_can_be_chosen(phantom):

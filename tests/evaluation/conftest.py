@@ -1,25 +1,11 @@
 """Runs to evaluate, and volumes of other sizes to evaluate them on."""
 
-from functools import partial
-
 import numpy as np
 import pytest
 import SimpleITK
 import yaml
 
 from armscan.volumes.resampling import resample
-
-
-@pytest.fixture(autouse=True)
-def tracking_database(database):
-    """Give each test a database that has MLflow's tables already."""
-
-
-@pytest.fixture
-def answer(armscan, monkeypatch):
-    """Run `armscan evaluate` in this process; return its exit code and what it printed."""
-    monkeypatch.setenv("COLUMNS", "200")
-    return partial(armscan, "evaluate")
 
 
 @pytest.fixture

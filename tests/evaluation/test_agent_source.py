@@ -5,20 +5,21 @@ import json
 import pytest
 
 from armscan.training import load_checkpoint, save_checkpoint
+from tests.support.refusals import assert_refused
 from tests.support.tracked_runs import GUESSER, store_of, tracked
 from tests.test_run import runs_in
 
 
-def test_baselines_are_evaluated_by_their_run_or_by_name(answer, tmp_path, phantom):
+def test_baselines_are_evaluated_by_their_run_or_by_name(evaluate, tmp_path, phantom):
     run_id = tracked(tmp_path, "projection=zy", agent=GUESSER)
-    assert answer(run_id, "--trust", "--data=phantom", "--phantoms=2", "--episodes=2", "--out=run.json")[0] == 0
+    assert evaluate(run_id, "--trust", "--data=phantom", "--phantoms=2", "--episodes=2", "--out=run.json")[0] == 0
     words = [
         "--agent=sac",
         "~agent.network",
         "agent._target_=tests.support.tracked_runs.GuesserOfAnything",
         "projection=zy",
     ]
-    code, _, errors = answer(
+    code, _, errors = evaluate(
         *words, "--data=phantom", "--phantoms=2", "--episodes=2", "--max-steps=50", "--out=agent.json"
     )
     assert (code, errors) == (0, "")
@@ -28,7 +29,7 @@ def test_baselines_are_evaluated_by_their_run_or_by_name(answer, tmp_path, phant
     assert "mlflow.parentRunId" not in tags
 
 
-def test_baseline_takes_a_preset_as_a_run_does_and_an_experiment_of_mlflow(answer, tmp_path):
+def test_baseline_takes_a_preset_as_a_run_does_and_an_experiment_of_mlflow(evaluate, tmp_path):
     words = [
         "--agent=random",
         "experiment=best_full",
@@ -38,7 +39,7 @@ def test_baseline_takes_a_preset_as_a_run_does_and_an_experiment_of_mlflow(answe
         "--tracking-experiment=x",
         "evaluation.on_plane=[[3,5]]",
     ]
-    code, printed, errors = answer(*words)
+    code, printed, errors = evaluate(*words)
     assert (code, errors) == (0, "")
     client = store_of(tmp_path)
     (run,) = client.search_runs([client.get_experiment_by_name("x").experiment_id])
@@ -47,24 +48,24 @@ def test_baseline_takes_a_preset_as_a_run_does_and_an_experiment_of_mlflow(answe
     assert run.data.params["agent._target_"] == "armscan.agents.Random"
 
 
-def test_evaluate_of_a_multirun_asks_for_one_of_its_jobs(answer, tmp_path):
+def test_evaluate_of_a_multirun_asks_for_one_of_its_jobs(evaluate, tmp_path):
     job_id = tracked(tmp_path)
     client = store_of(tmp_path)
     parent = client.create_run(client.get_run(job_id).info.experiment_id, run_name="multirun")
     client.set_tag(job_id, "mlflow.parentRunId", parent.info.run_id)
-    _, _, errors = answer(parent.info.run_id)
+    _, _, errors = evaluate(parent.info.run_id)
     assert errors == f"error: run {parent.info.run_id} is the parent of a multirun: give one of its jobs, {job_id}"
 
 
-def test_runs_that_have_kept_too_little_are_refused_with_what_to_do(answer, tmp_path):
+def test_runs_that_have_kept_too_little_are_refused_with_what_to_do(evaluate, tmp_path):
     run_id = tracked(tmp_path, kept=())
-    assert answer(run_id)[2].startswith(f"error: run {run_id} has no config.yaml among its artifacts, as each")
+    assert_refused(evaluate(run_id), f"run {run_id} has no config.yaml among its artifacts, as each")
     run_id = tracked(tmp_path, kept=("config.yaml", "volumes.json"))
-    assert answer(run_id)[2] == (f"error: run {run_id} stored no checkpoint: nothing to evaluate")
+    assert evaluate(run_id)[2] == (f"error: run {run_id} stored no checkpoint: nothing to evaluate")
     client = store_of(tmp_path)
     for status, ended in (("KILLED", "ended before its time (KILLED)"), ("RUNNING", "is still running, or was killed")):
         client.update_run(run_id, status=status)
-        assert answer(run_id)[2] == (
+        assert evaluate(run_id)[2] == (
             f"error: run {run_id} {ended}, and a run keeps its checkpoint in the store at its end: resume it with "
             f"python -m armscan.run resume={run_id}"
         )
@@ -91,32 +92,31 @@ def with_nan(weights, facts):
         (with_nan, "best.pt: holds weights that are not finite, in "),
     ],
 )
-def test_checkpoints_that_are_none_of_the_run_are_refused_before_anything_is_tracked(answer, tmp_path, change, line):
+def test_checkpoints_that_are_none_of_the_run_are_refused_before_anything_is_tracked(evaluate, tmp_path, change, line):
     run_id = tracked(tmp_path)
     save_checkpoint(tmp_path / "best.pt", *change(*load_checkpoint(tmp_path / "best.pt")))
     client, runs = runs_in(tmp_path)
     client.log_artifact(run_id, str(tmp_path / "best.pt"))
-    code, _, errors = answer(run_id)
-    assert code == 2
-    assert errors.startswith(f"error: run {run_id}: {line}")
-    assert len(errors) < 350
+    refused = evaluate(run_id)
+    assert_refused(refused, f"run {run_id}: {line}")
+    assert len(refused[2]) < 350
     assert len(runs_in(tmp_path)[1]) == len(runs)
 
 
 @pytest.mark.parametrize("name", ["config.yaml", "volumes.json", "best.pt"])
-def test_artifacts_that_were_changed_are_refused(answer, tmp_path, name):
+def test_artifacts_that_were_changed_are_refused(evaluate, tmp_path, name):
     run_id = tracked(tmp_path)
     contents = (tmp_path / name).read_bytes()
     (tmp_path / name).write_bytes(contents.replace(b"0", b"1"))
     client = store_of(tmp_path)
     client.log_artifact(run_id, str(tmp_path / name))
     what = "best.pt: is damaged" if name == "best.pt" else f"its {name} is not the one that it was started with"
-    assert answer(run_id)[2].startswith(f"error: run {run_id}: {what}")
+    assert_refused(evaluate(run_id), f"run {run_id}: {what}")
 
 
 @pytest.mark.parametrize(("text", "what"), [("a: [", "is damaged"), ("3", "is damaged")])
-def test_configuration_without_a_sum_must_still_be_one(answer, tmp_path, text, what):
+def test_configuration_without_a_sum_must_still_be_one(evaluate, tmp_path, text, what):
     run_id = tracked(tmp_path, kept=())
     (tmp_path / "config.yaml").write_text(text)
     store_of(tmp_path).log_artifact(run_id, str(tmp_path / "config.yaml"))
-    assert answer(run_id)[2] == f"error: run {run_id}: its config.yaml {what}"
+    assert evaluate(run_id)[2] == f"error: run {run_id}: its config.yaml {what}"

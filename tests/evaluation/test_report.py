@@ -1,28 +1,23 @@
 """The tables of an evaluation."""
 
 from dataclasses import replace
-from io import StringIO
 
 import pytest
-from rich.console import Console
 
 from armscan.evaluation.report import EvaluationReport, report_tables
 from armscan.training import Evaluation
-from tests.training.test_train import evaluation_of
+from tests.training.test_result_table import text_of
+from tests.training.test_train import episode_of, evaluation_of
 
 
 def printed(episodes):
     report = EvaluationReport({"test volumes": Evaluation(tuple(episodes))}, has_total=False, facts={})
-    console = Console(width=200, record=True, file=StringIO())
-    for part in report_tables(report, 200):
-        console.print(part)
-    return console.export_text()
+    return text_of(report_tables(report, 200), 200)
 
 
 @pytest.fixture
 def doubting():
-    (usual,) = evaluation_of(1).episodes
-    return [replace(usual, seed=i, distance_mm=float(i), expected_mm=float(i), expected_deg=1.0) for i in range(4)]
+    return [episode_of(seed=i, distance_mm=float(i), expected_mm=float(i), expected_deg=1.0) for i in range(4)]
 
 
 def test_tables_show_the_errors_of_what_an_agent_is_surest_and_least_sure_of(doubting):
@@ -41,8 +36,7 @@ def test_tables_of_agents_without_doubt_say_nothing_of_it(doubting):
 
 
 def test_metrics_of_volumes_with_similar_names_stay_apart():
-    (usual,) = evaluation_of(3).episodes
-    episodes = [replace(usual, volume=name, n_steps=n_steps) for n_steps, name in enumerate(("a(1)", "a[1]"), 1)]
+    episodes = [episode_of(n_steps, volume=name) for n_steps, name in enumerate(("a(1)", "a[1]"), 1)]
     report = EvaluationReport({"volumes": Evaluation(tuple(episodes))}, has_total=False, facts={})
     of_volumes = [metrics for group, metrics in report.metrics().items() if group.startswith("volume/")]
     assert [metrics["mean_steps"] for metrics in of_volumes] == [1.0, 2.0]

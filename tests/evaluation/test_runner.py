@@ -25,20 +25,20 @@ def test_evaluate_judges_a_run_as_it_was_trained(tmp_path, data_folder):
     assert {file.path for file in client.list_artifacts(run.info.run_id)} >= {"best.pt", "config.yaml"}
 
 
-def test_evaluate_gives_the_same_figures_again(answer, tmp_path):
+def test_evaluate_gives_the_same_figures_again(evaluate, tmp_path):
     run_id = tracked(tmp_path, "projection=zy")
     figures = []
     # The second replaces the first.
     for _ in range(2):
-        assert answer(run_id, "--episodes=4", "--seed=3", "--out=a.json")[0] == 0
+        assert evaluate(run_id, "--episodes=4", "--seed=3", "--out=a.json")[0] == 0
         contents = json.loads((tmp_path / "a.json").read_text())["splits"]["test volumes"]["figures"]
         figures.append({key: value for key, value in contents.items() if "seconds" not in key})
     assert figures[0] == figures[1]
 
 
-def test_agent_is_applied_to_volumes_of_other_sizes_and_spacing(answer, tmp_path, coarse_folder):
+def test_agent_is_applied_to_volumes_of_other_sizes_and_spacing(evaluate, tmp_path, coarse_folder):
     run_id = tracked(tmp_path, "reward=agreement", "env.clustering=metric")
-    code, printed, errors = answer(run_id, f"--data={coarse_folder}", "--episodes=3")
+    code, printed, errors = evaluate(run_id, f"--data={coarse_folder}", "--episodes=3")
     assert (code, errors) == (0, "")
     assert "note: train split: a pixel is 0.4 mm across (trained on 0.27)" in printed
     contents = written(tmp_path)
@@ -47,7 +47,9 @@ def test_agent_is_applied_to_volumes_of_other_sizes_and_spacing(answer, tmp_path
     assert contents["notes"]
 
 
-def test_labelled_planes_that_score_too_little_are_refused_with_what_may_be_the_reason(answer, tmp_path, coarse_folder):
+def test_labelled_planes_that_score_too_little_are_refused_with_what_may_be_the_reason(
+    evaluate, tmp_path, coarse_folder
+):
     run_id = tracked(tmp_path)
     manifest = yaml.safe_load((coarse_folder / "manifest.yaml").read_text())
     manifest["volumes"]["b.nii.gz"]["translation"][1] -= 60
@@ -56,23 +58,23 @@ def test_labelled_planes_that_score_too_little_are_refused_with_what_may_be_the_
         ("--seed=0", "here a pixel has 0.45 x 0.5 mm: unless the plane is wrong, --clustering metric may see them"),
         ("--clustering=metric", "but it must score above -success_threshold = -0.05"),
     ):
-        code, _, errors = answer(run_id, f"--data={coarse_folder}", "--episodes=2", word)
+        code, _, errors = evaluate(run_id, f"--data={coarse_folder}", "--episodes=2", word)
         assert code == 2
         assert errors.startswith("error: b.nii.gz: the labelled optimal plane scores")
         assert errors.endswith(ending)
 
 
-def test_images_of_another_shape_are_refused_with_the_reason(answer, tmp_path, coarse_folder):
+def test_images_of_another_shape_are_refused_with_the_reason(evaluate, tmp_path, coarse_folder):
     run_id = tracked(tmp_path, "obs=slice", "obs.shape=null", "env.clustering=metric", *IMAGES)
-    code, _, errors = answer(run_id, f"--data={coarse_folder}", "--episodes=2")
+    code, _, errors = evaluate(run_id, f"--data={coarse_folder}", "--episodes=2")
     assert code == 2
     assert "the agent was trained on images of" in errors
     assert "it cannot be applied to them" in errors
-    assert answer(run_id, "--data=phantom", "--phantoms=1", "--episodes=1")[0] == 0
+    assert evaluate(run_id, "--data=phantom", "--phantoms=1", "--episodes=1")[0] == 0
 
 
-def test_run_that_has_not_kept_what_it_was_trained_on_is_refused_by_its_network(answer, tmp_path, coarse_folder):
+def test_run_that_has_not_kept_what_it_was_trained_on_is_refused_by_its_network(evaluate, tmp_path, coarse_folder):
     run_id = tracked(tmp_path, "obs=slice", "obs.shape=null", "env.clustering=metric", *IMAGES, has_tag=False)
-    code, _, errors = answer(run_id, f"--data={coarse_folder}", "--episodes=2")
+    code, _, errors = evaluate(run_id, f"--data={coarse_folder}", "--episodes=2")
     assert code == 2
     assert "the checkpoint is another agent's or network's" in errors

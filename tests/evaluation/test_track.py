@@ -6,9 +6,9 @@ from tests.support.tracked_runs import store_of, tracked, written
 from tests.test_run import runs_in
 
 
-def test_evaluate_gives_figures_with_intervals_as_table_json_and_metrics(answer, tmp_path):
+def test_evaluate_gives_figures_with_intervals_as_table_json_and_metrics(evaluate, tmp_path):
     run_id = tracked(tmp_path)
-    code, printed, errors = answer(run_id, "--episodes=5", "--max-steps=3", "--success-threshold=0.04")
+    code, printed, errors = evaluate(run_id, "--episodes=5", "--max-steps=3", "--success-threshold=0.04")
     assert (code, errors) == (0, "")
     for word in (
         "on plane,",
@@ -41,14 +41,14 @@ def test_evaluate_gives_figures_with_intervals_as_table_json_and_metrics(answer,
     assert 0.0 <= child.data.metrics["random/test_volumes/on_plane_5mm_10deg"] <= 1.0
     # The run itself stays as it was, and an evaluation is nothing to evaluate.
     assert not client.get_run(run_id).data.metrics
-    code, _, errors = answer(contents["tracked_as"])
+    code, _, errors = evaluate(contents["tracked_as"])
     assert (code, errors) == (2, f"error: run is {contents['tracked_as']!r}, but that is an evaluation, of {run_id}")
 
 
-def test_evaluate_makes_nothing_where_artifacts_are_read_only(answer, tmp_path, made_read_only):
+def test_evaluate_makes_nothing_where_artifacts_are_read_only(evaluate, tmp_path, made_read_only):
     run_id = tracked(tmp_path)
     with made_read_only(tmp_path / "artifacts"):
-        code, _, errors = answer(run_id, "--episodes=3")
+        code, _, errors = evaluate(run_id, "--episodes=3")
     assert code == 2
     assert errors.startswith(f"error: the artifacts of runs lie in {tmp_path}/artifacts")
     assert len(runs_in(tmp_path)[1]) == 1

@@ -10,6 +10,7 @@ import pytest
 from PIL import Image, ImageChops
 
 from armscan.training import load_checkpoint, save_checkpoint
+from tests.support.refusals import assert_refused
 from tests.support.tracked_runs import GUESSER, ON_FILES, store_of, tracked
 
 EPISODE = re.compile(r"^(.+): (\S+), seed (\d+): (no )?success after (\d+) steps?, ([\d.]+) mm", re.MULTILINE)
@@ -17,9 +18,9 @@ GUESSER_OF_ANYTHING = ["--agent=sac", "~agent.network", "agent._target_=tests.su
 
 
 @pytest.fixture
-def answer(armscan):
-    """Run `armscan evaluate --video` in this process; return its exit code and what it printed."""
-    return partial(armscan, "evaluate", "--video")
+def record(evaluate):
+    """Run `armscan evaluate --video`, as `evaluate` does."""
+    return partial(evaluate, "--video")
 
 
 def gif_frames(file):
@@ -43,9 +44,9 @@ def difference(one, other):
     return np.asarray(ImageChops.difference(one, other)).mean()
 
 
-def test_video_is_of_the_episodes_of_an_evaluation_frame_by_frame_in_both_files(answer, armscan, tmp_path):
+def test_video_is_of_the_episodes_of_an_evaluation_frame_by_frame_in_both_files(record, evaluate, tmp_path):
     run_id = tracked(tmp_path, "projection=zy")
-    code, printed, errors = answer(run_id[:8], "--episodes=2", "--seed=4", "--max-steps=3")
+    code, printed, errors = record(run_id[:8], "--episodes=2", "--seed=4", "--max-steps=3")
     assert (code, errors) == (0, "")
     told = EPISODE.findall(printed)
     assert [(label, volume, seed) for label, volume, seed, *_ in told] == [
@@ -53,7 +54,7 @@ def test_video_is_of_the_episodes_of_an_evaluation_frame_by_frame_in_both_files(
         ("test volumes", "phantom-2000000", "5"),
     ]
     words = [run_id, "--episodes=2", "--seed=4", "--max-steps=3", "--out=a.json"]
-    assert armscan("evaluate", *words)[0] == 0
+    assert evaluate(*words)[0] == 0
     episodes = json.loads((tmp_path / "a.json").read_text())["episodes"]["test volumes"]
     n_steps = [each["n_steps"] for each in episodes]
     assert [int(steps) for *_, steps, _ in told] == n_steps
@@ -75,19 +76,19 @@ def test_video_is_of_the_episodes_of_an_evaluation_frame_by_frame_in_both_files(
         at += ms // 100
 
 
-def test_video_goes_over_every_split_of_a_folder_and_says_what_is_known(answer, tmp_path, wrists):
+def test_video_goes_over_every_split_of_a_folder_and_says_what_is_known(record, tmp_path, wrists):
     run_id = tracked(tmp_path, "projection=zy", agent=GUESSER, **ON_FILES)
-    code, printed, errors = answer(run_id, "--trust", "--data=wrists", "--episodes=1", "--out=elsewhere/videos")
+    code, printed, errors = record(run_id, "--trust", "--data=wrists", "--episodes=1", "--out=elsewhere/videos")
     assert (code, errors) == (0, "")
     assert "note: the agent was trained on these volumes: " in printed
     assert [label for label, *_ in EPISODE.findall(printed)] == ["train split", "validation split", "test split"]
     assert {file.suffix for file in (tmp_path / "elsewhere" / "videos").iterdir()} == {".gif", ".mp4"}
 
 
-def test_baseline_is_recorded_without_a_store(answer, tmp_path):
+def test_baseline_is_recorded_without_a_store(record, tmp_path):
     (tmp_path / "mlruns.db").unlink()
     words = [*GUESSER_OF_ANYTHING, "--data=phantom", "--phantoms=2", "--max-steps=2"]
-    code, printed, errors = answer(*words)
+    code, printed, errors = record(*words)
     assert (code, errors) == (0, "")
     assert [volume for _, volume, *_ in EPISODE.findall(printed)] == [
         *("phantom-3000000", "phantom-3000001", "phantom-3000000")
@@ -96,9 +97,9 @@ def test_baseline_is_recorded_without_a_store(answer, tmp_path):
     assert not (tmp_path / "mlruns.db").exists()
 
 
-def test_checkpoints_that_are_gone_or_damaged_or_anothers_are_refused(answer, tmp_path):
+def test_checkpoints_that_are_gone_or_damaged_or_anothers_are_refused(record, tmp_path):
     run_id = tracked(tmp_path, kept=("config.yaml", "volumes.json"))
-    assert answer(run_id)[2].startswith(f"error: run {run_id} has kept no checkpoint, so that there is nothing")
+    assert_refused(record(run_id), f"run {run_id} stored no checkpoint: nothing to evaluate")
     client = store_of(tmp_path)
     weights, facts = load_checkpoint(tmp_path / "best.pt")
     whole = (tmp_path / "best.pt").read_bytes()
@@ -109,7 +110,5 @@ def test_checkpoints_that_are_gone_or_damaged_or_anothers_are_refused(answer, tm
     ):
         change(tmp_path / "best.pt")
         client.log_artifact(run_id, str(tmp_path / "best.pt"))
-        code, _, errors = answer(run_id)
-        assert code == 2
-        assert errors.startswith(f"error: run {run_id}: {line}")
+        assert_refused(record(run_id), f"run {run_id}: {line}")
     assert not (tmp_path / "videos").exists()

@@ -15,18 +15,18 @@ def swapped(manifest):
     return manifest | {"splits": splits | {"train": splits["test"], "test": splits["train"]}}
 
 
-def test_own_volumes_are_those_of_the_folder_that_the_run_was_started_in(answer, tmp_path, wrists):
+def test_own_volumes_are_those_of_the_folder_that_the_run_was_started_in(evaluate, tmp_path, wrists):
     run_id = tracked(tmp_path, "projection=zy", agent=GUESSER, **ON_FILES)
     elsewhere = tmp_path / "elsewhere"
     shutil.copytree(wrists, elsewhere / "wrists")
     manifest = yaml.safe_load((wrists / "manifest.yaml").read_text())
     (elsewhere / "wrists" / "manifest.yaml").write_text(yaml.safe_dump(swapped(manifest)))
     words = [run_id, "--trust", "--episodes=2", f"--tracking=sqlite:///{tmp_path}/mlruns.db", "--out=a.json"]
-    code, _, errors = answer(*words, cwd=elsewhere)
+    code, _, errors = evaluate(*words, cwd=elsewhere)
     assert (code, errors) == (0, "")
     assert list(json.loads((elsewhere / "a.json").read_text())["volumes"]["test volumes"]) == manifest["splits"]["test"]
     wrists.rename(tmp_path / "away")
-    code, _, errors = answer(*words, cwd=elsewhere)
+    code, _, errors = evaluate(*words, cwd=elsewhere)
     assert code == 2
     assert errors.startswith(
         f"error: the volumes of run {run_id} cannot be read: {wrists}: the folder of volumes does not"
@@ -35,19 +35,19 @@ def test_own_volumes_are_those_of_the_folder_that_the_run_was_started_in(answer,
 
 
 @pytest.mark.parametrize("reward", ["published", "agreement"])
-def test_own_volumes_that_have_changed_are_refused_where_they_matter(answer, tmp_path, wrists, reward):
+def test_own_volumes_that_have_changed_are_refused_where_they_matter(evaluate, tmp_path, wrists, reward):
     run_id = tracked(tmp_path, f"reward={reward}", "projection=zy", agent=GUESSER, **ON_FILES)
     manifest = yaml.safe_load((wrists / "manifest.yaml").read_text())
     (wrists / "manifest.yaml").write_text(yaml.safe_dump(swapped(manifest)))
     line = f"the training volumes are not those that run {run_id} was started with: "
-    code, _, errors = answer(run_id, "--trust", "--episodes=2")
+    code, _, errors = evaluate(run_id, "--trust", "--episodes=2")
     assert code == 2
     assert errors.startswith(f"error: {line}")
-    code, printed, errors = answer(run_id, "--trust", "--data=wrists", "--episodes=4")
+    code, printed, errors = evaluate(run_id, "--trust", "--data=wrists", "--episodes=4")
     if reward == "agreement":
         assert code == 2
         assert errors.startswith(
-            "error: the reward is fitted to the volumes that the agent was trained on, but they are"
+            "error: the reward is fitted to the volumes that the agent was trained on, but they cannot be read: "
         )
         assert line in errors
     else:
@@ -60,7 +60,7 @@ def test_own_volumes_that_have_changed_are_refused_where_they_matter(answer, tmp
         assert f"<p>the agent was trained on these volumes: {known}</p>" in page.read_text()
 
 
-def test_volumes_of_the_training_are_known_under_other_names_and_others_under_theirs(answer, tmp_path, wrists):
+def test_volumes_of_the_training_are_known_under_other_names_and_others_under_theirs(evaluate, tmp_path, wrists):
     run_id = tracked(tmp_path, agent=GUESSER, **ON_FILES)
     manifest = yaml.safe_load((wrists / "manifest.yaml").read_text())
     one, _, third, last = manifest["volumes"]
@@ -71,17 +71,28 @@ def test_volumes_of_the_training_are_known_under_other_names_and_others_under_th
         shutil.copy(wrists / name, copies / copy)
     entries = {"copy.nii.gz": manifest["volumes"][one], third: manifest["volumes"][last]}
     (copies / "manifest.yaml").write_text(yaml.safe_dump({"volumes": entries}))
-    code, printed, errors = answer(run_id, "--trust", "--data=copies", "--episodes=2")
+    code, printed, errors = evaluate(run_id, "--trust", "--data=copies", "--episodes=2")
     assert (code, errors) == (0, "")
     assert f"note: the agent was trained on these volumes: copy.nii.gz (there {one})\n" in printed
-    assert f"note: the agent's checkpoint was chosen on other volumes of these names: {third}\n" in printed
+    assert "note: the agent's checkpoint was chosen on volumes of these names, but with other voxels" in printed
+    assert f"or another plane: {third}\n" in printed
 
 
-def test_run_without_fingerprints_is_evaluated_with_a_note(answer, tmp_path):
+def test_phantoms_are_of_the_version_that_the_run_was_trained_on(evaluate, tmp_path):
+    run_id = tracked(tmp_path, "projection=zy", "data.version=2", agent=GUESSER)
+    code, _, errors = evaluate(run_id, "--trust", "--data=phantom", "--phantoms=1", "--episodes=1")
+    assert (code, errors) == (0, "")
+    volumes = written(tmp_path)["volumes"]
+    assert {label: list(names) for label, names in volumes.items()} == {
+        "new phantoms of version 2": ["phantom-v2-3000000"]
+    }
+
+
+def test_run_without_fingerprints_is_evaluated_with_a_note(evaluate, tmp_path):
     run_id = tracked(tmp_path, agent=GUESSER, kept=("config.yaml",))
-    code, printed, _ = answer(run_id, "--trust", "--episodes=1")
+    code, printed, _ = evaluate(run_id, "--trust", "--episodes=1")
     assert code == 0
     assert "note: the run has no fingerprints of its volumes" in printed
-    code, printed, _ = answer(run_id, "--trust", "--data=phantom", "--phantoms=1", "--episodes=1")
+    code, printed, _ = evaluate(run_id, "--trust", "--data=phantom", "--phantoms=1", "--episodes=1")
     assert code == 0
     assert "fingerprints" not in printed

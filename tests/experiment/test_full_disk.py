@@ -6,8 +6,8 @@ import sys
 
 import pytest
 
-from tests.experiment.test_resume import COMMAND, LONGER, after_epochs, assert_ended_alike, finish
-from tests.support.disks import small_disk
+from tests.experiment.test_resume import LONGER, after_epochs, assert_ended_alike, finish
+from tests.support.processes import COMMAND
 from tests.support.waiting import HANG_S, wait_until
 from tests.test_run import armscan_run, runs_in
 
@@ -15,18 +15,11 @@ pytestmark = pytest.mark.slow
 FULL = "No space left on device"
 
 
-@pytest.fixture
-def disk(tmp_path):
-    """Yield a disk of 20 MB."""
-    with small_disk(tmp_path / "disk", "20m") as disk:
-        yield disk
-
-
 def run_until_full(disk, *words, cwd):
     """Run the command, fill the disk after its first epoch; return exit code, standard output and standard error."""
     printed, told = cwd / "printed", cwd / "told"
     with printed.open("w") as output, told.open("w") as errors:
-        process = subprocess.Popen([sys.executable, *COMMAND, *words], cwd=cwd, stdout=output, stderr=errors)
+        process = subprocess.Popen([*COMMAND, *words], cwd=cwd, stdout=output, stderr=errors)
     wait_until(lambda: after_epochs(1)(printed.read_text()), process=process, log=told.read_text, poll_s=0.01)
     disk.fill()
     return process.wait(HANG_S), printed.read_text(), told.read_text()

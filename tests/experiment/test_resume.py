@@ -5,23 +5,22 @@ import os
 import random
 import shutil
 import signal
-import subprocess
 import sys
 import time
 from functools import partial
 from pathlib import Path
 
 import pytest
-import torch
-from mlflow import MlflowClient
 
 import armscan
-from armscan.tracking import open_store
 from armscan.tracking.outbox import Address, Outbox
 from armscan.tracking.tags import GRID_TAG
 from armscan.training import load_checkpoint
 from armscan.utils.files import CONFIG_FILE, LAST_CHECKPOINT, VOLUMES_FILE, folder_lock, sha256
 from tests.support.killed_at import Moment, commands
+from tests.support.processes import COMMAND, start_run
+from tests.support.stores import store_in
+from tests.support.tensors import assert_same_tensors
 from tests.support.waiting import HANG_S, wait_until
 from tests.test_run import SMALL, TIMES, armscan_run, job_process_ids, runs_in
 
@@ -33,7 +32,6 @@ IMAGES += ["network=multimodal", "network.filters=[2,2,2]", "network.vector_size
 CHANGES = "{from_env_steps:300,agent.lr:0.01,agent.ent_coef_lr:0.01},{from_env_steps:700,agent.utd_ratio:0.5}"
 SCHEDULED = [*LONGER, f"training.schedule=[{CHANGES}]"]
 TWO = ("00001_labels.nii.gz", "00002_labels.nii.gz")
-COMMAND = ["-m", "armscan.run"]
 # The same, but every checkpoint stays unfinished for a while.
 SLOWLY_WRITTEN = """
 import sys, time, torch
@@ -46,16 +44,12 @@ torch.save = save_slowly
 from armscan.run import main
 sys.exit(main())
 """
-SLOWLY = ["-c", SLOWLY_WRITTEN]
+SLOWLY = (sys.executable, "-c", SLOWLY_WRITTEN)
 
 
-def killed(moment, *arguments, cwd, program=COMMAND):
+def killed(moment, *arguments, cwd, command=COMMAND):
     """Start the command, and kill it as soon as `moment` is true of what it has printed."""
-    with (cwd / "printed").open("w") as printed:
-        process = subprocess.Popen(
-            [sys.executable, *program, *arguments], cwd=cwd, stdout=printed, stderr=subprocess.STDOUT
-        )
-    printed = cwd / "printed"
+    process, printed = start_run(*arguments, cwd=cwd, command=command), cwd / "printed"
     wait_until(lambda: moment(printed.read_text()), process=process, log=printed.read_text, poll_s=0.01)
     process.kill()
     assert process.wait() == -signal.SIGKILL
@@ -74,13 +68,6 @@ def finish(run_id, cwd):
     assert ended.returncode == 0, ended.stderr
     assert ended.stderr == ""
     return ended.stdout
-
-
-def named_tensors(tree, name=""):
-    if isinstance(tree, torch.Tensor):
-        return {name: tree}
-    parts = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list | tuple) else []
-    return {key: tensor for part, tree in parts for key, tensor in named_tensors(tree, f"{name}/{part}").items()}
 
 
 def figures(client, run):
@@ -104,9 +91,7 @@ def assert_ended_alike(cwd):
         assert wall_s == sorted(wall_s)
     folders = [Path(run.data.tags["folder"]) for run in runs]
     for file in ("best.pt", "last.pt"):
-        one, other = (named_tensors(load_checkpoint(folder / file)[0]) for folder in folders)
-        assert one.keys() == other.keys()
-        assert all(torch.equal(one[name], other[name]) for name in one), file
+        assert_same_tensors(*(load_checkpoint(folder / file)[0] for folder in folders))
     artifacts = [{file.path for file in client.list_artifacts(run.info.run_id)} for run in runs]
     assert artifacts[0] == artifacts[1]
     assert not unfinished(cwd)
@@ -114,7 +99,7 @@ def assert_ended_alike(cwd):
 
 @pytest.mark.full
 def test_run_killed_while_it_writes_a_checkpoint_goes_on_and_ends_as_if_it_had_not_been(tmp_path):
-    killed(lambda printed: after_epochs(1)(printed) and unfinished(tmp_path), *LONGER, cwd=tmp_path, program=SLOWLY)
+    killed(lambda printed: after_epochs(1)(printed) and unfinished(tmp_path), *LONGER, cwd=tmp_path, command=SLOWLY)
     assert unfinished(tmp_path)
     (run,) = runs_in(tmp_path)[1]
     assert run.info.status == "RUNNING"
@@ -151,7 +136,7 @@ def test_run_killed_again_and_again_ends_as_if_it_had_not_been(tmp_path, argumen
     word = f"resume={run.info.run_id}"
     for _ in range(2):
         killed(soon_after(after_epochs(1)), word, cwd=tmp_path)
-    killed(lambda _: unfinished(tmp_path), word, cwd=tmp_path, program=SLOWLY)
+    killed(lambda _: unfinished(tmp_path), word, cwd=tmp_path, command=SLOWLY)
     finish(run.info.run_id, tmp_path)
     assert runs_in(tmp_path)[1][0].data.tags["resumed"] == "4"
     assert armscan_run(*arguments, cwd=tmp_path).returncode == 0
@@ -206,13 +191,7 @@ def test_run_killed_at_twenty_moments_ends_with_the_same_weights_and_figures(tmp
 
 @pytest.mark.slow
 def test_interrupted_run_says_how_to_go_on_and_only_one_process_may(tmp_path):
-    with (tmp_path / "printed").open("w") as printed:
-        process = subprocess.Popen(
-            [sys.executable, *COMMAND, *LONGER, "training.env_steps=5000"],
-            cwd=tmp_path,
-            stdout=printed,
-            stderr=subprocess.STDOUT,
-        )
+    process = start_run(*LONGER, "training.env_steps=5000", cwd=tmp_path)
     wait_until(lambda: (tmp_path / "printed").read_text().count("/5000 steps") >= 2, process=process)
     (run,) = runs_in(tmp_path)[1]
     # Still running, and not finished before the other has started.
@@ -237,17 +216,8 @@ def test_interrupted_run_says_how_to_go_on_and_only_one_process_may(tmp_path):
 
 @pytest.mark.slow
 def test_killed_job_of_a_multirun_is_resumed_by_its_own_id(tmp_path):
-    command = [
-        sys.executable,
-        *COMMAND,
-        "-m",
-        "seed=0,1",
-        "hydra.launcher.n_jobs=2",
-        *LONGER,
-        "training.env_steps=2000",
-    ]
-    with (tmp_path / "printed").open("w") as printed:
-        process = subprocess.Popen(command, cwd=tmp_path, stdout=printed, stderr=subprocess.STDOUT)
+    words = ["-m", "seed=0,1", "hydra.launcher.n_jobs=2", *LONGER, "training.env_steps=2000"]
+    process = start_run(*words, cwd=tmp_path)
     wait_until(lambda: (tmp_path / "printed").read_text().count("[0 seed=0] ") >= 4, process=process)
     os.kill(job_process_ids(process.pid)[0], signal.SIGKILL)
     assert process.wait(HANG_S) == 1
@@ -264,9 +234,7 @@ def test_killed_job_of_a_multirun_is_resumed_by_its_own_id(tmp_path):
 @pytest.fixture
 def cut_off(tmp_path, database):
     """Make a run that was cut off before anything was learned; return its client, ID and folder."""
-    client, experiment_id = open_store(
-        database, experiment="armscan", artifacts=str(tmp_path / "mlartifacts"), wait_s=60.0
-    )
+    client, experiment_id = store_in(tmp_path, "armscan", artifacts="mlartifacts")
     folder = tmp_path / "outputs" / "run"
     folder.mkdir(parents=True)
     (folder / CONFIG_FILE).write_text("seed: 3\n")
@@ -289,8 +257,7 @@ def refused(answer, *words):
 
 @pytest.mark.parametrize("beside", ["seed=1", "-m", "--multirun", "--cfg=job", "tracking.experiment=x", "resume=b"])
 def test_resume_takes_nothing_beside_it(answer, tmp_path, beside):
-    printed = refused(answer, "resume=a", beside)
-    assert beside in printed or "'b'" in printed
+    assert ("'b'" if beside == "resume=b" else beside) in refused(answer, "resume=a", beside)
     assert not list(tmp_path.iterdir())
 
 
@@ -379,8 +346,7 @@ def test_resume_refuses_a_run_of_something_else(answer, cut_off):
 
 def test_resume_refuses_a_checkpoint_that_is_damaged_or_gone_and_leaves_the_run_as_it_is(answer, tmp_path):
     assert answer(*SMALL)[0] == 0
-    client = MlflowClient(tracking_uri=f"sqlite:///{tmp_path}/mlruns.db")
-    (run,) = runs_in(tmp_path)[1]
+    client, (run,) = runs_in(tmp_path)
     client.set_terminated(run.info.run_id, "KILLED")
     last = Path(run.data.tags["folder"]) / LAST_CHECKPOINT
     contents = last.read_bytes()

@@ -13,11 +13,11 @@ from armscan.experiment.job import JobOutcome
 from armscan.launch.folds_grid import with_folds
 from armscan.launch.folds_table import AGENT, folds_table, keep_table
 from armscan.launch.grid_plan import print_grid_plan
-from armscan.tracking import open_store
 from armscan.tracking.tags import NOTE_TAG
 from armscan.training import TEST, Evaluation, MetricEstimates
 from armscan.utils.files import RESULTS_PAGE
-from tests.training.test_train import evaluation_of
+from tests.support.stores import store_in
+from tests.training.test_train import episode_of
 
 
 @pytest.fixture
@@ -94,8 +94,7 @@ def test_impossible_folds_are_refused_before_anything_runs(folder):
 
 
 def left_by_a_run(folder, volume, distances_mm):
-    (usual,) = evaluation_of(1).episodes
-    episodes = [replace(usual, volume=volume, seed=i, distance_mm=mm) for i, mm in enumerate(distances_mm)]
+    episodes = [episode_of(volume=volume, seed=i, distance_mm=mm) for i, mm in enumerate(distances_mm)]
     folder.mkdir()
     evaluation = Evaluation(tuple(episodes)).to_dict()
     (folder / "evaluation.json").write_text(json.dumps({TEST: evaluation, "training volumes": evaluation}))
@@ -143,7 +142,7 @@ def test_every_wrist_counts_alike_however_many_a_fold_has(tmp_path):
 
 
 def test_page_and_description_of_all_folds_say_what_is_missing(tmp_path, database):
-    store, experiment_id = open_store(database, experiment="a", artifacts=str(tmp_path / "artifacts"), wait_s=60.0)
+    store, experiment_id = store_in(tmp_path, "a")
     run_id = store.create_run(experiment_id, name="grid", tags={}).info.run_id
     table = folds_table([(left_by_a_run(tmp_path / "a", "wrist", [1.0]), "data.fold=0")])
     jobs = jobs_table({"1": JobOutcome("", "data.fold=1", failure="out of memory")}, {})

@@ -10,6 +10,7 @@ from armscan.config.compose import compose
 from armscan.errors import InvalidValueError
 from armscan.launch.launchers import check_launcher
 from armscan.utils.log import silence_libraries
+from tests.support import FEW_VOLUMES
 
 
 @pytest.mark.parametrize(
@@ -23,7 +24,7 @@ from armscan.utils.log import silence_libraries
 def test_launcher_without_its_package_says_what_to_install(monkeypatch, answer, launcher, package, command):
     monkeypatch.setitem(sys.modules, package, None)
     line = f"error: hydra/launcher is {launcher!r}, but {package} is not installed: {command}"
-    study = ["-m", "sweep=sac_y", "data.n_training=1", "data.n_validation=1", "data.n_test=1"]
+    study = ["-m", "sweep=sac_y", *FEW_VOLUMES]
     for words in (study, ["-m", "seed=0,1"]):
         assert answer(*words, f"hydra/launcher={launcher}") == (2, line)
 

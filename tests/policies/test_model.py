@@ -3,11 +3,10 @@
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
-import urllib.error
 import urllib.request
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -24,12 +23,13 @@ from armscan.tracking import TrackedRun, open_store
 from tests.agents.conftest import ALGORITHMS, ENV_FACTORIES, setup_for
 from tests.agents.test_plane_finder import made as made_finder
 from tests.agents.test_policy import observed, taught
+from tests.support.mlflow_server import is_answered
+from tests.support.ports import LOOPBACK, free_port
 from tests.support.waiting import HANG_S, wait_until
 
 # They export seven policies and serve two of them.
 pytestmark = pytest.mark.full
 
-LOOPBACK = "127.0.0.1"
 FINDER = ("plane_finder", "looks")
 VARIANTS = [*((algorithm, made_of) for algorithm in ALGORITHMS for made_of in ENV_FACTORIES), FINDER]
 # Loads each given model and asks it, for a batch of one and for all; prints which packages it has imported.
@@ -118,7 +118,8 @@ def test_model_is_served_and_answers_over_http_as_the_learner_acts(made):
     try:
         for variant, (server, port, log) in zip(variants, servers, strict=True):
             _, arrays, acted = made[variant]
-            wait_for(server, port, log)
+            ping = partial(is_answered, f"http://{LOOPBACK}:{port}/ping")
+            wait_until(ping, process=server, log=log.read_text, poll_s=0.1)
             for n in (1, 7):
                 parts = {name: part[:n].tolist() for name, part in arrays.items()} if isinstance(arrays, dict) else None
                 given = {"inputs": parts or arrays[:n].tolist()}
@@ -130,10 +131,7 @@ def test_model_is_served_and_answers_over_http_as_the_learner_acts(made):
 
 
 def serve(model):
-    with socket.socket() as free:
-        free.bind((LOOPBACK, 0))
-        port = free.getsockname()[1]
-    log = model.parent / "server.log"
+    port, log = free_port(), model.parent / "server.log"
     words = ["models", "serve", "-m", str(model), "--env-manager", "local", "-h", LOOPBACK, "-p", str(port)]
     bin_folder = Path(sys.executable).parent
     with log.open("wb") as said:
@@ -146,17 +144,6 @@ def serve(model):
             start_new_session=True,
         )
     return server, port, log
-
-
-def wait_for(server, port, log):
-    def answers():
-        try:
-            with urllib.request.urlopen(f"http://{LOOPBACK}:{port}/ping", timeout=5):
-                return True
-        except (urllib.error.URLError, OSError):
-            return False
-
-    wait_until(answers, process=server, log=log.read_text, poll_s=0.1)
 
 
 def invoke(port, given):

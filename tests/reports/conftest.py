@@ -1,5 +1,6 @@
 """Real tracked runs of two agents with three seeds each, made once, and invented trainings."""
 
+import csv
 import sys
 from functools import partial
 
@@ -10,7 +11,8 @@ from mlflow import MlflowClient
 
 from armscan import run
 from armscan.reports.load import Series, TrackedTraining
-from armscan.training import EpisodeResult, Evaluation
+from armscan.training import Evaluation
+from tests.training.test_train import episode_of
 
 SMALL = [
     *("data.n_training=1", "data.n_validation=1", "data.n_test=2", "training.env_steps=400", "env.max_steps=6"),
@@ -91,20 +93,11 @@ def make_training():
     return make
 
 
+def rows(file):
+    """Return the rows of a CSV file."""
+    with file.open(newline="") as opened:
+        return list(csv.DictReader(opened))
+
+
 def make_episode(volume, n_steps):
-    return EpisodeResult(
-        volume=volume,
-        seed=0,
-        n_steps=n_steps,
-        is_success=True,
-        starts_solved=False,
-        episode_return=-1.0,
-        final_reward=0.0,
-        best_reward=0.0,
-        distance_mm=float(n_steps),
-        distance_deg=0.0,
-        dice_bones=1.0,
-        dice_tendons=1.0,
-        dice_artery=1.0,
-        seconds_per_plane=0.1,
-    )
+    return episode_of(n_steps, volume=volume, distance_mm=float(n_steps), distance_deg=0.0)

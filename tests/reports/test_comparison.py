@@ -1,6 +1,5 @@
 """Comparisons of made-up groups: numbers, settings and volumes."""
 
-import csv
 from dataclasses import replace
 
 import pytest
@@ -9,7 +8,7 @@ from armscan.reports.comparison import write_comparison
 from armscan.reports.groups import group_trainings
 from armscan.reports.significance import compare_groups, final_metrics
 from armscan.training import Evaluation
-from tests.reports.conftest import make_episode
+from tests.reports.conftest import make_episode, rows
 
 
 @pytest.fixture
@@ -18,12 +17,7 @@ def written(tmp_path):
 
     def write(*trainings):
         file = write_comparison(*group_trainings(trainings), "runs", tmp_path)
-
-        def rows(name):
-            with (tmp_path / f"{name}.csv").open() as opened:
-                return list(csv.DictReader(opened))
-
-        return file.read_text(), rows
+        return file.read_text(), lambda name: rows(tmp_path / f"{name}.csv")
 
     return write
 

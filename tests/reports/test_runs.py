@@ -1,6 +1,5 @@
 """The report of runs, as a user makes and opens it, on real tracked runs."""
 
-import csv
 import json
 import os
 import shutil
@@ -9,14 +8,10 @@ from pathlib import Path
 import pytest
 from mlflow.entities import Metric, Param
 
+from tests.reports.conftest import rows
 from tests.support.refusals import assert_refused
 
 SECTIONS = ["Learning curves", "On the test volumes", "Which is likely to be better", "Episodes", "Runs", "Numbers"]
-
-
-def rows(file):
-    with file.open() as opened:
-        return list(csv.DictReader(opened))
 
 
 def page(folder):

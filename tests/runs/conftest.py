@@ -8,8 +8,9 @@ from functools import partial
 import pytest
 
 from armscan.experiment.provenance import place_tags
-from armscan.tracking import TrackedRun, open_store
+from armscan.tracking import TrackedRun
 from armscan.utils.files import CONFIG_FILE, SHA256_TAGS, sha256
+from tests.support.stores import store_in
 
 HOLDER = """
 import sys
@@ -22,8 +23,7 @@ with FileLock(sys.argv[1]):
 
 @pytest.fixture
 def store(tmp_path, database):
-    artifacts = str(tmp_path / "mlartifacts")
-    return open_store(database, experiment="armscan", artifacts=artifacts, wait_s=60.0)
+    return store_in(tmp_path, "armscan", artifacts="mlartifacts")
 
 
 @pytest.fixture

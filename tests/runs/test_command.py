@@ -15,8 +15,8 @@ from armscan.runs.run_folder import RunSkippedError
 from armscan.tracking import open_store
 from armscan.tracking.outbox import file_of
 from armscan.utils.files import LOCK_FILE
+from tests.support import FEW_VOLUMES, REPOSITORY
 from tests.support.refusals import assert_refused
-from tests.test_run import REPOSITORY
 
 
 def test_runs_answers_mistakes_in_one_line(answer, make_run, tmp_path):
@@ -122,7 +122,7 @@ def test_what_another_prune_has_removed_is_no_failure(store, make_run, capsys, t
 @pytest.mark.full
 def test_run_that_goes_on_ends_as_if_nothing_had_been_removed_beside_it(store, make_run, answer, tmp_path):
     old = make_run("old")
-    words = ["agent=random", "data.n_training=1", "data.n_validation=1", "data.n_test=1", "evaluation.episodes=300"]
+    words = ["agent=random", *FEW_VOLUMES, "evaluation.episodes=300"]
     environment = os.environ | {"PYTHONPATH": str(REPOSITORY), "PYTHONUNBUFFERED": "1"}
     process = subprocess.Popen(
         [sys.executable, "-m", "armscan.run", *words],

@@ -7,8 +7,9 @@ import pytest
 from armscan.errors import TrackingError
 from armscan.evaluation import EvaluationReport
 from armscan.runs.model_card import Card
-from armscan.tracking import TrackedRun, load_run, open_store
+from armscan.tracking import TrackedRun, load_run
 from armscan.tracking.tags import EVALUATED_TAG
+from tests.support.stores import store_in
 from tests.training.test_train import evaluation_of
 
 OWN = {"test volumes": evaluation_of(2, 4).to_dict()}
@@ -19,7 +20,7 @@ BY_COMMAND = EvaluationReport({"test volumes": evaluation_of(6)}, has_total=Fals
 @pytest.fixture
 def keep(tmp_path, database):
     """Track a run with a file, as an evaluation of another run or of none; return its ID."""
-    store, experiment_id = open_store(database, experiment="test", artifacts=str(tmp_path / "artifacts"), wait_s=60.0)
+    store, experiment_id = store_in(tmp_path, "test")
 
     def kept(name, text, of=None):
         (tmp_path / name).write_text(text)

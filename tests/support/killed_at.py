@@ -20,6 +20,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from tests.support import REPOSITORY
+
 
 @dataclass(frozen=True)
 class Moment:
@@ -87,7 +89,7 @@ class Commands:
 def commands(folder: Path) -> Iterator[Commands]:
     """Yield a runner of commands in a folder; end its process at the end of the block."""
     program = [sys.executable, "-m", "tests.support.killed_at"]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[2]), *sys.path])}
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(REPOSITORY), *sys.path])}
     with subprocess.Popen(
         program, cwd=folder, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as process:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
 import subprocess
 import sys
 import urllib.error
@@ -13,9 +12,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from tests.support.ports import LOOPBACK, free_port
 from tests.support.waiting import wait_until
 
-LOOPBACK, STOP_S = "127.0.0.1", 10.0
+STOP_S = 10.0
 
 
 @contextmanager
@@ -49,9 +49,7 @@ class MlflowServer:
         }
         self._environment.pop("MLFLOW_TRACKING_URI", None)
         self._process: subprocess.Popen[bytes] | None = None
-        with socket.socket() as free:
-            free.bind((host, 0))
-            self.port = free.getsockname()[1]
+        self.port = free_port(host)
 
     @property
     def uri(self) -> str:
@@ -74,7 +72,7 @@ class MlflowServer:
                 stderr=log,
                 start_new_session=True,
             )
-        wait_until(self._answers, process=self._process, log=self.log.read_text, poll_s=0.1)
+        wait_until(lambda: is_answered(f"{self.uri}/health"), process=self._process, log=self.log.read_text, poll_s=0.1)
 
     def stop(self) -> None:
         """Stop it, and wait until its processes are gone."""
@@ -88,9 +86,11 @@ class MlflowServer:
             self._process.wait()
         self._process = None
 
-    def _answers(self) -> bool:
-        try:
-            with urllib.request.urlopen(f"{self.uri}/health", timeout=5) as answer:
-                return bool(answer.status == 200)
-        except (urllib.error.URLError, OSError):
-            return False
+
+def is_answered(url: str) -> bool:
+    """Return whether a server answers a request with status 200."""
+    try:
+        with urllib.request.urlopen(url, timeout=5) as answer:
+            return bool(answer.status == 200)
+    except (urllib.error.URLError, OSError):
+        return False

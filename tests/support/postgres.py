@@ -7,7 +7,6 @@ import os
 import pwd
 import shutil
 import signal
-import socket
 import subprocess
 import tempfile
 import time
@@ -16,11 +15,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from tests.support.ports import LOOPBACK, free_port
 from tests.support.waiting import wait_until
 
 USER, PASSWORD = "armscan", "not-to-be-shown"
 DEBIAN, PROGRAMS = Path("/usr/lib/postgresql"), ("initdb", "postgres")
-LOOPBACK = "127.0.0.1"
 
 
 def programs() -> Path | None:
@@ -74,9 +73,7 @@ class PostgresServer:
         self._account = _account() if os.geteuid() == 0 else None
         self._process: subprocess.Popen[bytes] | None = None
         self._numbers, self._settings = itertools.count(), dict(settings or {})
-        with socket.socket() as free:
-            free.bind((host, 0))
-            self.port = free.getsockname()[1]
+        self.port = free_port(host)
         password = folder / "password"
         password.write_text(PASSWORD)
         if self._account is not None:

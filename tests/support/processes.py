@@ -1,14 +1,39 @@
-"""Processes of this machine: find those that tests have left, and end them."""
+"""Processes of this machine: start commands, find what tests have left, and end it."""
 
 from __future__ import annotations
 
 import os
 import signal
 import subprocess
-from collections.abc import Callable, Iterable
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 from tests.support.waiting import wait_until
+
+COMMAND = (sys.executable, "-m", "armscan.run")
+
+
+def start_run(
+    *words: str, cwd: Path, command: Sequence[str] = COMMAND, environment: Mapping[str, str] | None = None
+) -> subprocess.Popen[bytes]:
+    """Start a command in a session of its own; its output goes to the file `printed`.
+
+    Args:
+        *words: Words of its command line.
+        cwd: Folder that it is started in.
+        command: Words before these. Default: `python -m armscan.run`.
+        environment: Environment variables beside those of this process.
+    """
+    with (cwd / "printed").open("wb") as printed:
+        return subprocess.Popen(
+            [*command, *words],
+            cwd=cwd,
+            env=os.environ | (environment or {}),
+            stdout=printed,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
 
 
 def processes_in(folder: Path) -> list[int]:

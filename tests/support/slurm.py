@@ -10,9 +10,10 @@ import socket
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
+from tests.support.ports import free_ports
 from tests.support.processes import end_all, with_variable
 from tests.support.waiting import wait_until
 
@@ -95,7 +96,7 @@ class Slurm:
         key.chmod(0o400)
         for name in ("state", "spool"):
             (folder / name).mkdir()
-        ports = dict(zip(("slurmctld_port", "slurmd_port"), _free_ports(2), strict=True))
+        ports = dict(zip(("slurmctld_port", "slurmd_port"), free_ports(2), strict=True))
         values = {"folder": folder, "host": socket.gethostname(), "user": getpass.getuser(), **ports}
         self._conf.write_text(CONFIGURATION.format(**values))
         files = {"key-file": "key", "socket": "socket", "pid-file": "pid", "seed-file": "seed", "log-file": "log"}
@@ -155,12 +156,3 @@ class Slurm:
 
 def _found(program: str) -> str | None:
     return shutil.which(program, path=f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin")
-
-
-def _free_ports(n: int) -> list[int]:
-    # All at once, so that they differ.
-    with ExitStack() as stack:
-        sockets = [stack.enter_context(socket.socket()) for _ in range(n)]
-        for each in sockets:
-            each.bind(("127.0.0.1", 0))
-        return [each.getsockname()[1] for each in sockets]

@@ -10,12 +10,14 @@ from omegaconf import OmegaConf
 
 from armscan.config.compose import compose
 from armscan.experiment.build import build_experiment
-from armscan.tracking import TrackedRun, open_store
+from armscan.tracking import TrackedRun
 from armscan.tracking.tags import DOMAIN_TAG
 from armscan.training import TrainingDomain, save_checkpoint
 from armscan.utils.files import SHA256_TAGS, sha256
+from tests.support import FEW_VOLUMES
+from tests.support.stores import store_in
 
-FEW = ["data.n_training=1", "data.n_validation=1", "data.n_test=1", "env.max_steps=4"]
+FEW = [*FEW_VOLUMES, "env.max_steps=4"]
 
 IMAGES = ["network.images.filters=[2,2,2]", "network.images.vector_sizes=[4]", "network.images.head_sizes=[4]"]
 IMAGES += ["agent.buffer_size=500", "agent.num_envs=1", "agent.learning_starts=1"]
@@ -53,9 +55,7 @@ def tracked(folder, *overrides, agent=None, kept=("config.yaml", "volumes.json",
         config.agent = agent
     with contextlib.chdir(folder):
         experiment = build_experiment(config)
-    client, experiment_id = open_store(
-        f"sqlite:///{folder}/mlruns.db", experiment="armscan", artifacts=str(folder / "artifacts"), wait_s=60.0
-    )
+    client, experiment_id = store_in(folder, "armscan")
     domain = TrainingDomain.of(experiment.env_factory.make_env(experiment.split.training))
     (folder / "config.yaml").write_text(yaml.safe_dump(OmegaConf.to_container(config)))
     (folder / "volumes.json").write_text(json.dumps(experiment.split.fingerprints()))

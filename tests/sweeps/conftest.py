@@ -1,6 +1,7 @@
 """Storages of every kind, and studies in them that train nothing."""
 
 import shutil
+from functools import partial
 from types import SimpleNamespace
 
 import optuna
@@ -30,17 +31,17 @@ def storage_uri(request, tmp_path):
             return request.getfixturevalue("postgres").make_database()
 
 
+def scheduler_at(uri, *, plan=None, **limits):
+    """Open the study of a storage, as workers do."""
+    storage = open_storage(uri)
+    study = optuna.create_study(study_name="a", storage=storage.optuna, load_if_exists=True)
+    return TrialScheduler(study, storage, Limits(**{"n_trials": 5} | limits), plan)
+
+
 @pytest.fixture
 def make_scheduler(storage_uri):
-    """Open the same study again and again, as workers do."""
-
-    def make(**limits):
-        storage = open_storage(storage_uri)
-        study = optuna.create_study(study_name="a", storage=storage.optuna, load_if_exists=True)
-        plan = limits.pop("plan", None)
-        return TrialScheduler(study, storage, Limits(**{"n_trials": 5} | limits), plan)
-
-    return make
+    """Open the same study again and again."""
+    return partial(scheduler_at, storage_uri)
 
 
 @pytest.fixture

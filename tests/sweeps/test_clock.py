@@ -1,18 +1,18 @@
 """A study while the wall clock jumps: leases and waits are measured on clocks that do not."""
 
-import subprocess
 from datetime import datetime, timedelta
 
 import optuna
 import pytest
-from mlflow import MlflowClient
 from optuna.trial import TrialState, create_trial
 
 from armscan.sweeps.scheduling.state import BEAT_S, StudyState
 from armscan.sweeps.storage.attribute_names import LEASE
 from tests.support.clock import WallClock
+from tests.support.processes import start_run
 from tests.support.waiting import HANG_S, wait_until
-from tests.sweeps.test_command import COMMAND, TINY, trials_of
+from tests.sweeps.test_command import TINY, trials_of
+from tests.test_run import runs_in
 
 N_TRIALS = 5
 
@@ -20,14 +20,8 @@ N_TRIALS = 5
 @pytest.mark.slow
 def test_study_whose_clock_jumps_an_hour_either_way_finishes_every_trial_once(tmp_path):
     clock, printed = WallClock(tmp_path / "clock"), tmp_path / "printed"
-    with printed.open("w") as output:
-        study = subprocess.Popen(
-            [*COMMAND, *TINY, f"study.n_trials={N_TRIALS}", "study.workers=2", "study.final_eval.top_k=0"],
-            cwd=tmp_path,
-            env=clock.environment,
-            stdout=output,
-            stderr=subprocess.STDOUT,
-        )
+    words = [*TINY, f"study.n_trials={N_TRIALS}", "study.workers=2", "study.final_eval.top_k=0"]
+    study = start_run(*words, cwd=tmp_path, environment=clock.environment)
 
     def finished():
         return sum(trial.state.is_finished() for trial in trials_of(tmp_path))
@@ -43,8 +37,7 @@ def test_study_whose_clock_jumps_an_hour_either_way_finishes_every_trial_once(tm
     # The jumps are visible, otherwise nothing was tested.
     began = [trial.datetime_start for trial in trials]
     assert max(began) - min(began) > timedelta(minutes=55)
-    client = MlflowClient(f"sqlite:///{tmp_path}/mlruns.db")
-    runs = client.search_runs([client.get_experiment_by_name("armscan").experiment_id])
+    runs = runs_in(tmp_path)[1]
     assert {run.info.status for run in runs} == {"FINISHED"}
     assert len([run for run in runs if "trial" in run.data.tags and "seed" in run.data.tags]) == N_TRIALS
 

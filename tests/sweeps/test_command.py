@@ -1,6 +1,5 @@
 """Studies as a user starts them: real workers, killed and interrupted, on phantoms."""
 
-import csv
 import json
 import os
 import re
@@ -8,12 +7,11 @@ import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
-import numpy as np
 import optuna
 import pytest
 from hydra.errors import HydraException
-from mlflow import MlflowClient
 from optuna.artifacts import get_all_artifact_meta
 from optuna_dashboard import get_note
 from optuna_dashboard._note import get_note_from_system_attrs
@@ -23,11 +21,16 @@ from armscan.config.error_messages import one_line_message
 from armscan.errors import ArmscanError, InvalidValueError, StudyError
 from armscan.sweeps.command import run_study
 from armscan.sweeps.storage.storage import open_storage
-from tests.support.processes import processes_in
+from tests.reports.conftest import rows
+from tests.support import FEW_VOLUMES
+from tests.support.processes import processes_in, start_run
+from tests.support.programs import imported_by
 from tests.support.waiting import HANG_S, wait_until
+from tests.test_run import armscan_run, runs_in
+from tests.training.test_result_table import recomputed
 
 TINY = [
-    *("-m", "sweep=sac_y", "data.n_training=1", "data.n_validation=1", "data.n_test=1", "training.env_steps=400"),
+    *("-m", "sweep=sac_y", *FEW_VOLUMES, "training.env_steps=400"),
     *(
         "training.eval_every_env_steps=200",
         "training.validation_episodes=2",
@@ -42,18 +45,6 @@ TINY = [
         "study.final_eval.judge_seeds=1",
     ),
 ]
-COMMAND = [sys.executable, "-m", "armscan.run"]
-
-
-def run(*words, cwd):
-    return subprocess.run([*COMMAND, *words], cwd=cwd, capture_output=True, text=True, check=False)
-
-
-def started(*words, cwd):
-    printed = (cwd / "printed").open("ab")
-    return subprocess.Popen(
-        [*COMMAND, *words], cwd=cwd, stdout=printed, stderr=subprocess.STDOUT, start_new_session=True
-    )
 
 
 def trials_of(folder, name="sac_y"):
@@ -72,34 +63,23 @@ def check_result(folder):
     """Compare the result in the report with its episodes, by NumPy alone."""
     report = [sys.executable, "-m", "armscan", "report", "--study", "sac_y", "--out", "report"]
     subprocess.run(report, cwd=folder, check=True, stdout=subprocess.DEVNULL)
-    with (folder / "report" / "result.csv").open(newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row["of"] == "agent"]
-    printed = {(row["trial"], row["figure"].removeprefix("test/")): float(row["value"]) for row in rows}
+    of_agents = [row for row in rows(folder / "report" / "result.csv") if row["of"] == "agent"]
+    printed = {(row["trial"], row["figure"].removeprefix("test/")): float(row["value"]) for row in of_agents}
     episodes = {}
     for trial in trials_of(folder, "sac_y-judged"):
         name = "control" if trial.user_attrs["judged"] < 0 else str(trial.user_attrs["judged"])
         (file,) = (folder / trial.user_attrs["folder"]).glob("seed_*/evaluation.json")
-        episodes.setdefault(name, []).extend(json.loads(file.read_text())["test volumes"]["episodes"])
+        of_seed = json.loads(file.read_text())["test volumes"]["episodes"]
+        episodes.setdefault(name, []).extend(SimpleNamespace(**each) for each in of_seed)
     assert "control" in episodes
     for name, of_seeds in episodes.items():
-        distance_mm, distance_deg, steps = (
-            np.array([each[key] for each in of_seeds]) for key in ("distance_mm", "distance_deg", "n_steps")
-        )
-        recomputed = {
-            "on_plane_5mm_10deg": np.mean((distance_mm <= 5) & (distance_deg <= 10)),
-            "on_plane_2mm_5deg": np.mean((distance_mm <= 2) & (distance_deg <= 5)),
-            "median_distance_mm": np.median(distance_mm),
-            "p90_distance_mm": np.percentile(distance_mm, 90),
-            "median_distance_deg": np.median(distance_deg),
-            "success_rate": np.mean([each["is_success"] for each in of_seeds]),
-            "mean_steps": steps.mean(),
-        }
-        assert {key: printed[name, key] for key in recomputed} == pytest.approx(recomputed)
+        expected = recomputed(of_seeds)
+        assert {key: printed[name, key] for key in expected} == pytest.approx(expected)
 
 
 @pytest.mark.full
 def test_study_runs_its_trials_judges_the_best_and_goes_on_when_it_is_asked_for_more(tmp_path, monkeypatch):
-    ended = run(*TINY, "study.n_trials=2", cwd=tmp_path)
+    ended = armscan_run(*TINY, "study.n_trials=2", cwd=tmp_path)
     assert ended.returncode == 0, ended.stderr
     assert ended.stderr == ""
     # Two trials of the search, then the best of them and the control.
@@ -111,8 +91,7 @@ def test_study_runs_its_trials_judges_the_best_and_goes_on_when_it_is_asked_for_
     ):
         assert line in ended.stdout
     check_result(tmp_path)
-    client = MlflowClient(f"sqlite:///{tmp_path}/mlruns.db")
-    runs = client.search_runs([client.get_experiment_by_name("armscan").experiment_id])
+    client, runs = runs_in(tmp_path)
     by_id = {each.info.run_id: each for each in runs}
     assert {each.info.status for each in runs} == {"FINISHED"}
     # Only the trainings of the judgement keep their policies.
@@ -152,7 +131,9 @@ def test_study_runs_its_trials_judges_the_best_and_goes_on_when_it_is_asked_for_
         link = f"http://127.0.0.1:5000/#/experiments/{tracked.info.experiment_id}/runs/{tracked.info.run_id}"
         assert link in get_note_from_system_attrs(notes, trial._trial_id)["body"]
     assert len({trial.params["agent.lr"] for trial in trials_of(tmp_path)}) == 2
-    again = run(*TINY, "study.n_trials=3", "study.final_eval.top_k=0", cwd=tmp_path)
+    # The volumes are those of the command; its workers know none.
+    assert "study.volumes.test" in optuna.load_study(study_name="sac_y", storage=storage).user_attrs["fixed_config"]
+    again = armscan_run(*TINY, "study.n_trials=3", "study.final_eval.top_k=0", cwd=tmp_path)
     assert again.returncode == 0, again.stderr
     assert [trial.state.name for trial in trials_of(tmp_path)] == ["COMPLETE"] * 3
     monkeypatch.chdir(tmp_path)
@@ -169,7 +150,7 @@ def unwrapped(printed):
 def test_study_ends_by_itself_where_the_noise_between_seeds_is_larger_than_what_may_be_gained(tmp_path):
     words = [*TINY, "study/terminator=noise", "study.terminator.min_trials=4", "study.seeds=[0,1]", "study.workers=1"]
     words += ["study.objectives=[maximize mean_return]", "study.n_trials=30", "study.final_eval.top_k=0"]
-    ended = run(*words, cwd=tmp_path)
+    ended = armscan_run(*words, cwd=tmp_path)
     assert ended.returncode == 0, ended.stderr
     trials = trials_of(tmp_path)
     assert 4 <= len(trials) < 30
@@ -179,8 +160,8 @@ def test_study_ends_by_itself_where_the_noise_between_seeds_is_larger_than_what_
     told = re.search(f"the study has ended by itself: ({reason})", unwrapped(ended.stdout))
     assert float(told[2]) < float(told[3])
     # The plan gives the same reason, and the same command prints the same result without a worker.
-    assert told[1] in unwrapped(run(*words, "--plan", cwd=tmp_path).stdout)
-    again = run(*words, cwd=tmp_path)
+    assert told[1] in unwrapped(armscan_run(*words, "--plan", cwd=tmp_path).stdout)
+    again = armscan_run(*words, cwd=tmp_path)
     assert again.returncode == 0
     assert again.stdout.partition("best while searching")[2] == ended.stdout.partition("best while searching")[2] != ""
     assert len(workers_in(tmp_path)) == 1
@@ -190,7 +171,7 @@ def test_study_ends_by_itself_where_the_noise_between_seeds_is_larger_than_what_
 @pytest.mark.slow
 def test_study_survives_a_killed_worker_and_hands_its_trials_back_when_it_is_interrupted(tmp_path):
     words = [*TINY, "study.n_trials=2", "study.final_eval.top_k=0", "training.env_steps=200000"]
-    process = started(*words, cwd=tmp_path)
+    process = start_run(*words, cwd=tmp_path)
 
     def have_reported(n_trials):
         return sum(len(trial.intermediate_values) > 3 for trial in trials_of(tmp_path)) == n_trials
@@ -215,9 +196,7 @@ def test_study_survives_a_killed_worker_and_hands_its_trials_back_when_it_is_int
     assert time.monotonic() - at_s < 60
     assert processes_in(tmp_path) == []
     assert sorted(trial.state.name for trial in trials_of(tmp_path)) == ["FAIL", "WAITING", "WAITING"]
-    client = MlflowClient(f"sqlite:///{tmp_path}/mlruns.db")
-    runs = client.search_runs([client.get_experiment_by_name("armscan").experiment_id])
-    assert "RUNNING" not in {each.info.status for each in runs}
+    assert "RUNNING" not in {each.info.status for each in runs_in(tmp_path)[1]}
     printed = (tmp_path / "printed").read_text()
     assert printed.endswith("interrupted; the same command resumes the study\n")
     assert "Traceback" not in printed
@@ -226,7 +205,7 @@ def test_study_survives_a_killed_worker_and_hands_its_trials_back_when_it_is_int
 @pytest.mark.full
 def test_interrupted_study_kills_a_worker_that_does_not_leave_and_enqueues_its_trial_again(tmp_path):
     words = [*TINY, "study.n_trials=2", "study.final_eval.top_k=0", "training.env_steps=200000"]
-    process = started(*words, cwd=tmp_path)
+    process = start_run(*words, cwd=tmp_path)
     wait_until(lambda: sum(bool(trial.intermediate_values) for trial in trials_of(tmp_path)) == 2, process=process)
     os.kill(workers_in(tmp_path)[0], signal.SIGSTOP)
     os.kill(process.pid, signal.SIGINT)
@@ -235,135 +214,102 @@ def test_interrupted_study_kills_a_worker_that_does_not_leave_and_enqueues_its_t
     assert sorted(trial.state.name for trial in trials_of(tmp_path)) == ["FAIL", "WAITING", "WAITING"]
 
 
+# Words after `-m sweep=sac_y`, and a part of the answer.
+MISTAKES = [
+    ("sweep=sac_zy", "sweep is given 2 times, but it must be once"),
+    ("resume=true", "resume is not for a study, which resumes by its own command"),
+    ("hydra/launcher=foo", "hydra/launcher is 'foo', but it must be basic, joblib"),
+    ("hydra.searchpath=[/nowhere]", "hydra.searchpath names '/nowhere', but there is no"),
+    ("study=null", "study is a section of the configuration: give its keys, such as"),
+    ("agent.lr=1,2", "'agent.lr=1,2' gives several values, but those of a study come"),
+    ("study.seeds=0,1", "'study.seeds=0,1' gives several values, but a study has one"),
+    ("+tracking.foo=1", "there is no key 'foo' in tracking, but only uri, experiment, artifacts, wait_s,"),
+    ("study.folder=/dev/null", "study.folder is '/dev/null', but '/dev/null' is not a folder"),
+    ("study.artifacts=/dev/null/a", "study.artifacts is '/dev/null/a', but '/dev/null' is"),
+    ("study.space.agent.choices=[null]", "study.space: agent=null is not allowed: "),
+    ("+study.foo=1", "there is no key 'foo' in study, but only "),
+    ("study.n_trials=0", "study.n_trials is 0, but it must be"),
+    ("study.objectives=[minimize foo]", "study.objectives names 'foo', but a trial"),
+    ("study.objectives=[up mean_steps]", "study.objectives is ['up mean_steps'], but"),
+    (
+        "study.objectives=[minimize mean_steps,maximize mean_steps]",
+        "study.objectives is ['minimize mean_steps', 'maximize mean_steps'], but it must be a list such as",
+    ),
+    ("study.seeds=[1,1]", "study.seeds is [1, 1], but it must be a list of at least one seed, such as"),
+    ("study.seeds=0", "study.seeds is 0, but it must be a list of at least one seed"),
+    ("study.seeds=[99999999999]", "study.seeds is [99999999999], but it must be a list"),
+    ("study.seed=99999999999", "study.seed is 99999999999, but it must be"),
+    ("+study.sampler.foo=1", "study.sampler cannot be made: TPESampler.__init__() got an"),
+    ("+study.pruner.foo=1", "study.pruner cannot be made: MedianPruner.__init__() got an"),
+    ("study.sampler._target_=os.getcwd", "study.sampler cannot be made: "),
+    ("study.sampler._target_=collections.Counter", "but it must be a sampler of Optuna"),
+    ("study.pruner._target_=collections.Counter", "but it must be a pruner of Optuna"),
+    ("study.task._target_=foo.Foo", "study.task cannot be made: Error loading 'foo.Foo'"),
+    ("study.task._target_=collections.Counter", "which has no metrics, as a task must"),
+    ("study.storage=3", "study.storage is 3, but it must be a string that says where"),
+    ("study.storage=''", "study.storage is '', but it must be a string that says where"),
+    ("study.folder=''", "study.folder is '', but it must be a string that says where"),
+    ("study.storage=/dev/null/a", "study.storage is '/dev/null/a', but no file can be"),
+    ("study.storage=/dev/null/a", "--plan", "study.storage is '/dev/null/a', but no file"),
+    ("study.final_eval=3", "study.final_eval is 3, but it must be a section with top_k"),
+    ("study.pruner=median", "study.pruner is 'median', but it must be a section with a _target_"),
+    (
+        "study.objectives=[minimize mean_steps,maximize success_rate]",
+        "study.pruner is optuna.pruners.MedianPruner, which compares one objective, but study.objectives has 2",
+    ),
+    ("study/sampler=best", "study/sampler is 'best', but it must be cmaes, "),
+    ("study.name=a/b", "study.name is 'a/b', but it must begin with a letter"),
+    (f"study.name={'a' * 101}", "have at most 100 characters"),
+    ("study.name=a-judged", "and not end in -selection or -judged, as final"),
+    (
+        "study.final_eval.mean_seeds=1",
+        "study.final_eval.min_seeds is 2, but it must be at most study.final_eval.mean_seeds, which is 1",
+    ),
+    (
+        "study.final_eval.judge_seeds=0",
+        "study.final_eval.judge_seeds is 0, but it must be a whole number from 1 to 1000",
+    ),
+    ("study.final_eval.n_seeds=2", "study.final_eval.n_seeds has been renamed: give study.final_eval.judge_seeds"),
+    ("study.workers=999", "--plan", "study.workers is 999, but this machine has "),
+    ("study.workers=999", "study.workers is 999, but this machine has "),
+    (
+        "study.storage=postgresql://me:secret@127.0.0.1:1/db",
+        "study.storage has a password in its address, where others could read it",
+    ),
+    (
+        "study.space.agent.lrr.choices=[1]",
+        "study.space: agent.lrr=1 is not allowed: there is no key 'lrr' in agent, but only ",
+    ),
+    (
+        "+study.space={agent.tau:{low:0.5,high:7.0}}",
+        "study.space: agent.tau=7.0 is not allowed: agent.tau is 7.0, but it must be",
+    ),
+    ("study.space={agent.lr:{choices:[1]}}", "study.space.agent.lr.choices=[...] on the command line replaces a range"),
+    ("study.space.seed.choices=[1,2]", "study.space.seed: 'seed' says how a study is run"),
+    (
+        "study.space.network.choices=[auto,mlp]",
+        "study.space.network.vector.hidden_sizes.choices=[[8]]",
+        "is not allowed: there is no key 'vector' in network, but only hidden_sizes or activation",
+    ),
+    ("agent=random", "but the trials of this study need one that learns"),
+    ("training.env_steps=-1", "training.env_steps is -1, but it must be a whole number"),
+]
+
+
 @pytest.mark.parametrize(
     ("words", "line"),
     [
         (["sweep=sac_y"], "a study has many runs, which needs -m: python -m armscan.run -m sweep=sac_y"),
         (["sweep=sac_y", "--plan"], "a study has many runs, which needs -m: python -m armscan.run -m sweep=sac_y"),
-        (["-m", "sweep=sac_y", "sweep=sac_zy"], "sweep is given 2 times, but it must be once"),
         (["-m", "sweep=foo"], "sweep is 'foo', but it must be landmarks, pbt_sac_zy, ppo_zy, sac_full"),
-        (["-m", "sweep=sac_y", "resume=true"], "resume is not for a study, which resumes by its own command"),
-        (
-            ["-m", "sweep=sac_y", "hydra/launcher=foo"],
-            "hydra/launcher is 'foo', but it must be basic, joblib",
-        ),
-        (["-m", "sweep=sac_y", "hydra.searchpath=[/nowhere]"], "hydra.searchpath names '/nowhere', but there is no"),
-        (["-m", "sweep=sac_y", "study=null"], "study is a section of the configuration: give its keys, such as"),
-        (["-m", "sweep=sac_y", "agent.lr=1,2"], "'agent.lr=1,2' gives several values, but those of a study come"),
-        (["-m", "sweep=sac_y", "study.seeds=0,1"], "'study.seeds=0,1' gives several values, but a study has one"),
-        (
-            ["-m", "sweep=sac_y", "+tracking.foo=1"],
-            "there is no key 'foo' in tracking, but only uri, experiment, artifacts, wait_s,",
-        ),
-        (
-            ["-m", "sweep=sac_y", "study.folder=/dev/null"],
-            "study.folder is '/dev/null', but '/dev/null' is not a folder",
-        ),
-        (["-m", "sweep=sac_y", "study.artifacts=/dev/null/a"], "study.artifacts is '/dev/null/a', but '/dev/null' is"),
-        (["-m", "sweep=sac_y", "study.space.agent.choices=[null]"], "study.space: agent=null is not allowed: "),
-        (["-m", "sweep=sac_y", "+study.foo=1"], "there is no key 'foo' in study, but only "),
-        (
-            ["-m", "sweep=sac_y", "study.n_trials=0"],
-            "study.n_trials is 0, but it must be",
-        ),
-        (
-            ["-m", "sweep=sac_y", "study.objectives=[minimize foo]"],
-            "study.objectives names 'foo', but a trial",
-        ),
-        (
-            ["-m", "sweep=sac_y", "study.objectives=[up mean_steps]"],
-            "study.objectives is ['up mean_steps'], but",
-        ),
-        (
-            ["-m", "sweep=sac_y", "study.objectives=[minimize mean_steps,maximize mean_steps]"],
-            "study.objectives is ['minimize mean_steps', 'maximize mean_steps'], but it must be a list such as",
-        ),
-        (
-            ["-m", "sweep=sac_y", "study.seeds=[1,1]"],
-            "study.seeds is [1, 1], but it must be a list of at least one seed, such as",
-        ),
-        (["-m", "sweep=sac_y", "study.seeds=0"], "study.seeds is 0, but it must be a list of at least one seed"),
-        (["-m", "sweep=sac_y", "study.seeds=[99999999999]"], "study.seeds is [99999999999], but it must be a list"),
-        (["-m", "sweep=sac_y", "study.seed=99999999999"], "study.seed is 99999999999, but it must be"),
-        (["-m", "sweep=sac_y", "+study.sampler.foo=1"], "study.sampler cannot be made: TPESampler.__init__() got an"),
-        (["-m", "sweep=sac_y", "+study.pruner.foo=1"], "study.pruner cannot be made: MedianPruner.__init__() got an"),
-        (
-            ["-m", "sweep=sac_y", "study.sampler._target_=os.getcwd"],
-            "study.sampler cannot be made: ",
-        ),
-        (["-m", "sweep=sac_y", "study.sampler._target_=collections.Counter"], "but it must be a sampler of Optuna"),
-        (["-m", "sweep=sac_y", "study.pruner._target_=collections.Counter"], "but it must be a pruner of Optuna"),
-        (["-m", "sweep=sac_y", "study.task._target_=foo.Foo"], "study.task cannot be made: Error loading 'foo.Foo'"),
-        (["-m", "sweep=sac_y", "study.task._target_=collections.Counter"], "which has no metrics, as a task must"),
-        (["-m", "sweep=sac_y", "study.storage=3"], "study.storage is 3, but it must be a string that says where"),
-        (["-m", "sweep=sac_y", "study.storage=''"], "study.storage is '', but it must be a string that says where"),
-        (["-m", "sweep=sac_y", "study.folder=''"], "study.folder is '', but it must be a string that says where"),
-        (["-m", "sweep=sac_y", "study.storage=/dev/null/a"], "study.storage is '/dev/null/a', but no file can be"),
-        (["-m", "sweep=sac_y", "study.storage=/dev/null/a", "--plan"], "study.storage is '/dev/null/a', but no file"),
-        (["-m", "sweep=sac_y", "study.final_eval=3"], "study.final_eval is 3, but it must be a section with top_k"),
-        (
-            ["-m", "sweep=sac_y", "study.pruner=median"],
-            "study.pruner is 'median', but it must be a section with a _target_",
-        ),
-        (
-            ["-m", "sweep=sac_y", "study.objectives=[minimize mean_steps,maximize success_rate]"],
-            "study.pruner is optuna.pruners.MedianPruner, which compares one objective, but study.objectives has 2",
-        ),
-        (["-m", "sweep=sac_y", "study/sampler=best"], "study/sampler is 'best', but it must be cmaes, "),
-        (["-m", "sweep=sac_y", "study.name=a/b"], "study.name is 'a/b', but it must begin with a letter"),
-        (["-m", "sweep=sac_y", f"study.name={'a' * 101}"], "have at most 100 characters"),
-        (
-            ["-m", "sweep=sac_y", "study.name=a-judged"],
-            "and not end in -selection or -judged, as final",
-        ),
-        (
-            ["-m", "sweep=sac_y", "study.final_eval.mean_seeds=1"],
-            "study.final_eval.min_seeds is 2, but it must be at most study.final_eval.mean_seeds, which is 1",
-        ),
-        (
-            ["-m", "sweep=sac_y", "study.final_eval.judge_seeds=0"],
-            "study.final_eval.judge_seeds is 0, but it must be a whole number from 1 to 1000",
-        ),
-        (
-            ["-m", "sweep=sac_y", "study.final_eval.n_seeds=2"],
-            "study.final_eval.n_seeds has been renamed: give study.final_eval.judge_seeds",
-        ),
-        (["-m", "sweep=sac_y", "study.workers=999", "--plan"], "study.workers is 999, but this machine has "),
-        (["-m", "sweep=sac_y", "study.workers=999"], "study.workers is 999, but this machine has "),
-        (
-            ["-m", "sweep=sac_y", "study.storage=postgresql://me:secret@127.0.0.1:1/db"],
-            "study.storage has a password in its address, where others could read it",
-        ),
-        (
-            ["-m", "sweep=sac_y", "study.space.agent.lrr.choices=[1]"],
-            "study.space: agent.lrr=1 is not allowed: there is no key 'lrr' in agent, but only ",
-        ),
-        (
-            ["-m", "sweep=sac_y", "+study.space={agent.tau:{low:0.5,high:7.0}}"],
-            "study.space: agent.tau=7.0 is not allowed: agent.tau is 7.0, but it must be",
-        ),
-        (
-            ["-m", "sweep=sac_y", "study.space={agent.lr:{choices:[1]}}"],
-            "study.space.agent.lr.choices=[...] on the command line replaces a range",
-        ),
-        (["-m", "sweep=sac_y", "study.space.seed.choices=[1,2]"], "study.space.seed: 'seed' says how a study is run"),
-        (
-            [
-                *("-m", "sweep=sac_y", "study.space.network.choices=[auto,mlp]"),
-                "study.space.network.vector.hidden_sizes.choices=[[8]]",
-            ],
-            "is not allowed: there is no key 'vector' in network, but only hidden_sizes or activation",
-        ),
-        (["-m", "sweep=sac_y", "agent=random"], "but the trials of this study need one that learns"),
-        (["-m", "sweep=sac_y", "training.env_steps=-1"], "training.env_steps is -1, but it must be a whole number"),
+        *((["-m", "sweep=sac_y", *words], line) for *words, line in MISTAKES),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
 def test_study_answers_mistakes_in_one_line_before_anything_is_there(tmp_path, monkeypatch, words, line):
     monkeypatch.chdir(tmp_path)
-    few = ["data.n_training=1", "data.n_validation=1", "data.n_test=1"]
     with pytest.raises((ArmscanError, HydraException)) as raised:
-        run_study([*words, *few], launch=lambda _: pytest.fail("workers were launched"))
+        run_study([*words, *FEW_VOLUMES], launch=lambda _: pytest.fail("workers were launched"))
     answer = one_line_message(raised.value)
     assert answer is not None
     assert line in answer
@@ -393,8 +339,5 @@ def test_study_answers_a_file_that_is_not_for_the_whole_configuration(tmp_path, 
 
 
 def test_what_watches_over_a_worker_loads_nothing_that_a_worker_trains_and_tracks_with():
-    program = (
-        "import sys, armscan.run, armscan.sweeps.workers.supervisor; "
-        "print([m for m in ('torch', 'mlflow', 'tianshou') if m in sys.modules])"
-    )
-    assert subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout == "[]\n"
+    loaded = imported_by("import armscan.run, armscan.sweeps.workers.supervisor")
+    assert not loaded & {"torch", "mlflow", "tianshou"}

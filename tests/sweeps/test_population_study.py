@@ -11,13 +11,14 @@ import time
 from collections import Counter
 
 import pytest
-import torch
 
 from armscan.sweeps.tasks.attempt import trial_folder
 from armscan.training import load_checkpoint
 from armscan.utils.processes import ProcessInfo
+from tests.support.processes import start_run
+from tests.support.tensors import assert_same_tensors
 from tests.support.waiting import HANG_S, wait_until
-from tests.sweeps.test_command import started, trials_of
+from tests.sweeps.test_command import trials_of
 
 N_MEMBERS, N_GENERATIONS, N_KILLS = 4, 3, 12
 SWEEP = """
@@ -88,7 +89,7 @@ def test_population_loses_no_member_to_kills_and_each_schedule_replays_to_the_sa
     (tmp_path / "sweeps").mkdir()
     (tmp_path / "sweeps" / "tiny.yaml").write_text(SWEEP.lstrip())
     drawn = random.Random(5)
-    process = started("-m", "sweep=tiny", cwd=tmp_path)
+    process = start_run("-m", "sweep=tiny", cwd=tmp_path)
     try:
         for n_complete in range(N_KILLS):
             kill_a_worker(tmp_path, process, drawn, n_complete)
@@ -121,5 +122,4 @@ def test_population_loses_no_member_to_kills_and_each_schedule_replays_to_the_sa
     for trial in [best, *([changed_most] if changed_most is not best else [])]:
         said, first, second = replayed(tmp_path, trial)
         assert "to the last bit" in said
-        assert first.keys() == second.keys()
-        assert all(torch.equal(first[name], second[name]) for name in first)
+        assert_same_tensors(first, second)

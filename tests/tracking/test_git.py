@@ -37,6 +37,15 @@ def contents(folder):
     return {str(file.relative_to(folder)): file.read_bytes() for file in files}
 
 
+def clone_with(diff, repository, folder):
+    """Return a clone of the repository to which a diff was applied."""
+    clone = folder / "clone"
+    git(folder, "clone", "--quiet", str(repository), str(clone))
+    (folder / "code.diff").write_bytes(diff)
+    git(clone, "apply", str(folder / "code.diff"))
+    return clone
+
+
 def test_source_of_a_clean_tree_is_its_commit_alone(repository):
     found = source_in(repository / "inner")
     assert found.diff == b""
@@ -58,11 +67,7 @@ def test_source_keeps_every_change_so_that_it_can_be_applied_again(repository, t
     found = source_in(repository / "inner")
     assert found.tags["git.dirty"] == "true"
     assert found.tags["git.diff.sha256"] == sha256(found.diff)
-    clone = tmp_path / "clone"
-    git(tmp_path, "clone", "--quiet", str(repository), str(clone))
-    (tmp_path / "code.diff").write_bytes(found.diff)
-    git(clone, "apply", str(tmp_path / "code.diff"))
-    assert contents(clone) == contents(repository)
+    assert contents(clone_with(found.diff, repository, tmp_path)) == contents(repository)
     # Looking has changed nothing.
     assert "A  staged.py" in git(repository, "status", "--porcelain")
 
@@ -79,10 +84,7 @@ def test_source_keeps_new_files_of_odd_names_and_links(repository, tmp_path):
     (repository / "broken").symlink_to("nowhere")
     (repository / "to_folder").symlink_to("inner")
     found = source_in(repository)
-    clone = tmp_path / "clone"
-    git(tmp_path, "clone", "--quiet", str(repository), str(clone))
-    (tmp_path / "code.diff").write_bytes(found.diff)
-    git(clone, "apply", str(tmp_path / "code.diff"))
+    clone = clone_with(found.diff, repository, tmp_path)
     assert contents(clone) == contents(repository)
     assert [(clone / name).readlink() for name in ("broken", "to_folder")] == [Path("nowhere"), Path("inner")]
 

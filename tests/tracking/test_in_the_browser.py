@@ -1,14 +1,16 @@
 """Runs in MLflow's UI: columns, best figures, pruned trials, datasets."""
 
 import json
+from functools import partial
 
 import pytest
 from mlflow.entities import Metric, Param
 
 from armscan.launch.best_job import BEST_TAG, show_best
-from armscan.tracking import TrackedRun, open_store
+from armscan.tracking import TrackedRun
 from armscan.tracking.uploader import set_description
 from armscan.tracking.view import VIEW, VIEW_TAG
+from tests.support.stores import store_in
 
 RATE, STEPS = "test_volumes/on_plane_5mm_10deg", "test_volumes/mean_steps"
 RANDOM_RATE = "random/on_plane_5mm_10deg"
@@ -16,8 +18,7 @@ RANDOM_RATE = "random/on_plane_5mm_10deg"
 
 @pytest.fixture
 def store(tmp_path):
-    settings = {"experiment": "a", "artifacts": str(tmp_path / "artifacts"), "wait_s": 10.0}
-    return lambda: open_store(f"sqlite:///{tmp_path}/mlruns.db", **settings)
+    return partial(store_in, tmp_path, "a")
 
 
 @pytest.fixture

@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 from mlflow.utils.validation import MAX_PARAM_VAL_LENGTH, MAX_TAG_VAL_LENGTH, _validate_param, _validate_tag
 
 from armscan.tracking.sanitize import MAX_PARAM_CHARS, MAX_TAG_CHARS, name_of, params_of, tags_of, truncate
+from tests.support.stores import store_in
 
 KEYS = st.text(min_size=1, max_size=300) | st.from_regex(r"[a-z_]{1,9}(\.[a-z_]{1,9}){0,40}", fullmatch=True)
 
@@ -24,9 +25,9 @@ def test_params_of_any_configuration_are_taken_and_none_is_lost(config):
 
 @given(KEYS)
 def test_tags_of_any_name_are_taken(key):
-    for name, value in tags_of({key: "x" * (MAX_TAG_CHARS + 1)}).items():
-        _validate_tag(name, value)
-        assert len(value) == MAX_TAG_CHARS
+    ((name, value),) = tags_of({key: "x" * (MAX_TAG_CHARS + 1)}).items()
+    _validate_tag(name, value)
+    assert len(value) == MAX_TAG_CHARS
 
 
 @pytest.mark.parametrize("key", ["agent.lr", "env.transform.rz_deg", "volumes.training", "a b/c:d-e", "x" * 250])
@@ -55,9 +56,9 @@ def test_shortened_text_is_as_long_as_it_may_be_at_most(text, at_most):
 
 
 def test_params_too_long_for_a_store_reach_it(tmp_path, database):
-    from armscan.tracking import TrackedRun, open_store
+    from armscan.tracking import TrackedRun
 
-    store, experiment_id = open_store(database, experiment="test", artifacts=str(tmp_path / "artifacts"), wait_s=60.0)
+    store, experiment_id = store_in(tmp_path, "test")
     config = {
         "long": "b" * 10_000,
         "k" * 300: 1,

@@ -4,16 +4,15 @@ import threading
 
 import pytest
 
-from armscan.tracking import TrackedRun, open_store
+from armscan.tracking import TrackedRun
 from armscan.tracking.system_metrics import SystemMetrics
+from tests.support.stores import store_in
 from tests.support.waiting import wait_until
 
 
 @pytest.fixture
 def store(tmp_path, database):
-    return open_store(
-        database, experiment="test", artifacts=str(tmp_path / "artifacts"), wait_s=60.0, system_metrics_s=0.05
-    )
+    return store_in(tmp_path, "test", system_metrics_s=0.05)
 
 
 def threads():
@@ -53,7 +52,7 @@ def test_system_metrics_of_a_run_end_with_its_training_and_go_on_with_it(store, 
 
 
 def test_system_metrics_are_not_looked_at_where_nobody_wants_them(tmp_path, database):
-    client, experiment_id = open_store(database, experiment="test", artifacts=str(tmp_path / "artifacts"), wait_s=60.0)
+    client, experiment_id = store_in(tmp_path, "test")
     with TrackedRun.start(client, experiment_id, name="n", config={}, tags={}, folder=tmp_path) as tracked:
         tracked.on_start(100, ())
         assert not threads()

@@ -1,7 +1,9 @@
 """Runs in MLflow, on a real SQLite store."""
 
 import contextlib
+import dataclasses
 import json
+import math
 import sqlite3
 import subprocess
 import sys
@@ -22,13 +24,15 @@ from armscan.tracking import (
     open_store,
     source,
 )
-from armscan.tracking.notes import notes
+from armscan.tracking.notes import NOTES_FOLDER, Note, notes
 from armscan.tracking.outbox import Address, Outbox, file_of
 from armscan.tracking.sanitize import flatten
 from armscan.tracking.sync import _upload_pending, sync
 from armscan.tracking.tags import VERSION_TAG
 from armscan.tracking.uploader import upload
 from armscan.training import EpochReport, TrainingResult
+from armscan.utils.processes import ProcessInfo
+from tests.support.stores import store_in
 from tests.support.waiting import wait_until
 from tests.training.test_train import evaluation_of
 
@@ -47,7 +51,7 @@ REPORTS = [
 
 @pytest.fixture
 def store(tmp_path, database):
-    return open_store(database, experiment="test", artifacts=str(tmp_path / "artifacts"), wait_s=60.0)
+    return store_in(tmp_path, "test")
 
 
 def eventually(look, is_there):
@@ -97,6 +101,18 @@ def test_tracked_run_keeps_parameters_curves_results_and_files(store, tmp_path):
     assert files == {"best.pt", "evaluation.json", "baselines.json", "results.html", "learning_curve.png"}
 
 
+def test_metric_that_is_not_valid_any_more_is_replaced_by_nan_where_that_is_asked_for(store, tmp_path):
+    client, experiment_id = store
+    run_id = client.create_run(experiment_id, name="n", tags={}).info.run_id
+    for value, options in ((1.0, {}), (math.nan, {"keeps_nan": True})):
+        with TrackedRun.open_existing(client, run_id, name="n", folder=tmp_path / str(value)) as tracked:
+            tracked.log_metrics({"a": value}, n_env_steps=0, **options)
+            tracked.log_metrics({"b": 2.0 * value}, n_env_steps=0)
+    metrics = client.get_run(run_id).data.metrics
+    assert math.isnan(metrics["a"])
+    assert metrics["b"] == 2.0
+
+
 def test_tracked_run_keeps_a_folder_with_all_in_it_and_what_makes_it_a_model_last(store, tmp_path):
     client, experiment_id = store
     model = tmp_path / "run" / "policy"
@@ -144,12 +160,12 @@ def test_file_outside_of_a_strangers_folder_is_not_uploaded(store, tmp_path, kin
     (folder / "link").symlink_to(tmp_path / "secret")
     outbox.add(file=names[kind])
     outbox.close()
-    (upload,) = sync(tmp_path, lambda _: client)
-    assert "is outside of the run's folder" in upload.left
+    (uploaded,) = sync(tmp_path, lambda _: client)
+    assert "is outside of the run's folder" in uploaded.left
     assert client.list_artifacts(run_id) == []
     # Nor by a process that resumes the run.
     with contextlib.closing(Outbox.begin(folder, Address(run_id, client.uri))) as outbox:
-        outbox.note()
+        outbox.note(client.uri)
         with pytest.raises(UntrustedError, match="add --trust"):
             upload(outbox, client.mlflow, "files")
     assert client.list_artifacts(run_id) == []
@@ -157,9 +173,24 @@ def test_file_outside_of_a_strangers_folder_is_not_uploaded(store, tmp_path, kin
     assert run_id in notes()
     _upload_pending(client)
     assert client.list_artifacts(run_id) == []
-    (upload,) = sync(tmp_path, lambda _: client, trust=True)
-    assert upload.left is None
+    (uploaded,) = sync(tmp_path, lambda _: client, trust=True)
+    assert uploaded.left is None
     assert len(client.list_artifacts(run_id)) == 1
+
+
+@pytest.mark.parametrize(
+    ("process", "is_kept"), [({"host": "elsewhere"}, True), ({"pid_namespace": "other"}, True), ({"boot": "1"}, False)]
+)
+def test_note_of_another_machine_stays_where_its_folder_cannot_be_seen(store, tmp_path, monkeypatch, process, is_kept):
+    monkeypatch.setenv("ARMSCAN_CACHE", str(tmp_path / "cache"))
+    client, experiment_id = store
+    run_id = client.create_run(experiment_id, name="n", tags={}).info.run_id
+    folder = tmp_path / "cache" / NOTES_FOLDER
+    folder.mkdir(parents=True)
+    noted = dataclasses.replace(ProcessInfo.current(), **process)
+    Note(tmp_path / "local to a node" / "outbox", client.uri, noted).write(folder / run_id)
+    _upload_pending(client)
+    assert (run_id in notes()) == is_kept
 
 
 @pytest.mark.parametrize("tags", [{}, {"folder": "/mine"}], ids=["a study's", "a training's"])
@@ -170,13 +201,13 @@ def test_strangers_folder_that_names_a_run_of_mine_writes_nothing_to_it(store, t
         outbox.add(tags={"x": "theirs"})
         outbox.add(metrics=[("x", 1.0, 0, 0)])
         outbox.add(status=("FAILED", 1))
-    (upload,) = sync(tmp_path, lambda _: client)
-    assert "the run was not tracked from here" in upload.left
-    assert "add --trust" in upload.left
+    (uploaded,) = sync(tmp_path, lambda _: client)
+    assert "the run was not tracked from here" in uploaded.left
+    assert "add --trust" in uploaded.left
     run = client.get_run(run_id)
     assert (run.info.status, run.data.metrics, run.data.tags.get("x")) == ("RUNNING", {}, None)
-    (upload,) = sync(tmp_path, lambda _: client, trust=True)
-    assert upload.left is None
+    (uploaded,) = sync(tmp_path, lambda _: client, trust=True)
+    assert uploaded.left is None
     assert client.get_run(run_id).info.status == "FAILED"
 
 

@@ -13,13 +13,16 @@ from tests.training.test_train import evaluation_of
 
 
 class Still:
-    """Stays in the middle."""
+    """Stays at a plane, by default in the middle."""
+
+    def __init__(self, action=0.0):
+        self._action = action
 
     def begin(self, *, seed, bounds):
         pass
 
     def act(self, observation, reward):
-        return np.zeros(1)
+        return np.array([self._action])
 
 
 class Oracle:

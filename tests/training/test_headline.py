@@ -1,7 +1,5 @@
 """The result in a few sentences: its difference to random planes recomputed by the test, and what it claims."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from scipy import stats
@@ -9,15 +7,14 @@ from scipy import stats
 from armscan.stats.bootstrap import difference_of_rates, wilson
 from armscan.training import Evaluation, MetricEstimates, ResultTable
 from armscan.training.headline import ABOVE_RANDOM, beside_random, headline
-from tests.training.test_train import evaluation_of
+from tests.training.test_train import episode_of
 
 
 def evaluation(rates, n=20):
     """Return episodes on volumes `v0`, `v1` and so on, of which these shares end on the plane."""
-    (one,) = evaluation_of(1).episodes
     return Evaluation(
         tuple(
-            dataclasses.replace(one, volume=f"v{k}", distance_mm=1.0 if i < round(rate * n) else 9.0, distance_deg=0.0)
+            episode_of(volume=f"v{k}", distance_mm=1.0 if i < round(rate * n) else 9.0, distance_deg=0.0)
             for k, rate in enumerate(rates)
             for i in range(n)
         )

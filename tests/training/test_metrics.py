@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 
 from armscan.training import Evaluation, MetricEstimates
-from tests.training.test_train import evaluation_of
+from tests.training.test_train import episode_of, evaluation_of
 
 
 def test_figures_agree_with_the_metrics_of_training():
@@ -29,18 +29,14 @@ def test_figures_agree_with_the_metrics_of_training():
 
 
 def test_figures_of_episodes_that_all_start_solved_are_not_those_of_others():
-    episodes = tuple(dataclasses.replace(episode, starts_solved=True) for episode in evaluation_of(1, 1).episodes)
-    metrics = MetricEstimates.of(Evaluation(episodes)).metrics()
+    metrics = MetricEstimates.of(Evaluation((episode_of(starts_solved=True),) * 2)).metrics()
     assert metrics["success_rate"] == 1.0
     assert metrics["success_rate_not_started_solved"] != metrics["success_rate_not_started_solved"]
 
 
 def test_errors_of_the_surest_and_the_least_sure_quarter_are_those_of_the_episodes_themselves():
-    (usual,) = evaluation_of(1).episodes
     episodes = tuple(
-        dataclasses.replace(
-            usual, seed=i, distance_mm=float(i), distance_deg=1.0, expected_mm=10.0 - i, expected_deg=float(i)
-        )
+        episode_of(seed=i, distance_mm=float(i), distance_deg=1.0, expected_mm=10.0 - i, expected_deg=float(i))
         for i in range(8)
     )
     figures = MetricEstimates.of(Evaluation(episodes))

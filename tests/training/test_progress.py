@@ -3,8 +3,9 @@
 import pytest
 from rich.console import Console
 
-from armscan.training import EpisodeResult, EpochReport, Evaluation
+from armscan.training import EpochReport, Evaluation
 from armscan.training.progress import ProgressBar
+from tests.training.test_train import episode_of
 
 
 @pytest.fixture
@@ -16,21 +17,8 @@ def narrow(monkeypatch):
 
 
 def test_progress_bar_shows_all_of_its_figures_in_80_columns(narrow):
-    episode = EpisodeResult(
-        volume="a",
-        seed=0,
-        n_steps=50,
-        is_success=True,
-        starts_solved=False,
-        episode_return=-123.456,
-        final_reward=0.0,
-        best_reward=0.0,
-        **dict.fromkeys(("distance_mm", "distance_deg", "dice_bones", "dice_tendons", "dice_artery"), 0.5),
-        seconds_per_plane=0.001,
-    )
-    report = EpochReport(
-        epoch=1, n_env_steps=120_000, wall_s=60.0, metrics={}, evaluation=Evaluation((episode,)), is_best=True
-    )
+    evaluation = Evaluation((episode_of(50, episode_return=-123.456),))
+    report = EpochReport(epoch=1, n_env_steps=120_000, wall_s=60.0, metrics={}, evaluation=evaluation, is_best=True)
     bar = ProgressBar("validation, 48 episodes, deterministic")
     bar.on_start(240_000, [report])
     bar.on_end()

@@ -1,6 +1,5 @@
 """The table of results: its figures recomputed by the test, its names, and how it fits its output."""
 
-import dataclasses
 import html.parser
 import io
 import math
@@ -12,17 +11,15 @@ from rich.console import Console
 from armscan.errors import InvalidValueError
 from armscan.training import Evaluation, MetricEstimates, OnPlane, ResultTable, check_on_plane
 from armscan.training.result_table import with_baselines
-from tests.training.test_train import evaluation_of
+from tests.training.test_train import episode_of, evaluation_of
 
 PLANE, STRICT = "on_plane_5mm_10deg", "on_plane_2mm_5deg"
 
 
 def made_episodes(seed, n=24, n_volumes=4):
     rng = np.random.default_rng(seed)
-    (one,) = evaluation_of(1).episodes
     return tuple(
-        dataclasses.replace(
-            one,
+        episode_of(
             volume=f"v{i % n_volumes}",
             seed=i,
             n_steps=int(rng.integers(1, 50)),

@@ -12,6 +12,7 @@ from hypothesis import given
 from armscan.errors import InvalidValueError
 from armscan.training import Split, mixed_data, nifti_data, phantom_data
 from armscan.training.subject_splits import _drawn
+from armscan.volumes import ManipulatorAction
 from tests.volumes.test_damaged import SETTINGS, anything, is_answered
 
 
@@ -173,6 +174,15 @@ def test_split_refuses_a_copy_of_a_volume_in_another_part(tiny_volume):
         InvalidValueError, match=r"c \(test\) is a copy of a \(training\), but a wrist must be in one split"
     ):
         Split({"a": tiny_volume, "b": replace(tiny_volume)}, {"d": other}, {"c": replace(tiny_volume)})
+
+
+def test_split_refuses_a_copy_that_has_another_plane(tiny_volume):
+    other = replace(tiny_volume, labels=np.roll(tiny_volume.labels, 1, axis=0))
+    copy = replace(tiny_volume, optimal_action=ManipulatorAction((1.0, 0.0), (0.0, 3.0)))
+    with pytest.raises(InvalidValueError, match=r"c \(test\) is a copy of a \(training\)"):
+        Split({"a": tiny_volume}, {"b": other}, {"c": copy})
+    # The same voxels of another size are another wrist's.
+    Split({"a": tiny_volume}, {"b": other}, {"c": replace(copy, spacing=(0.5, 0.5, 0.5))})
 
 
 def test_split_refuses_a_volume_in_two_parts(tiny_volume):

@@ -22,28 +22,28 @@ from armscan.training import (
 )
 
 
+def episode_of(n_steps=1, **changes):
+    """Return the result of an episode, by default one that ends on the plane."""
+    facts = {
+        "volume": "v",
+        "seed": 0,
+        "is_success": True,
+        "starts_solved": False,
+        "episode_return": -0.5 * n_steps,
+        "final_reward": 0.0,
+        "best_reward": 0.0,
+        "distance_mm": 1.0,
+        "distance_deg": 2.0,
+        "dice_bones": 0.9,
+        "dice_tendons": 0.8,
+        "dice_artery": 0.7,
+        "seconds_per_plane": 0.01,
+    }
+    return EpisodeResult(n_steps=n_steps, **facts | changes)
+
+
 def evaluation_of(*lengths, success=True, distance_mm=1.0):
-    return Evaluation(
-        tuple(
-            EpisodeResult(
-                volume="v",
-                seed=0,
-                n_steps=length,
-                is_success=success,
-                starts_solved=False,
-                episode_return=-0.5 * length,
-                final_reward=0.0,
-                best_reward=0.0,
-                distance_mm=distance_mm,
-                distance_deg=2.0,
-                dice_bones=0.9,
-                dice_tendons=0.8,
-                dice_artery=0.7,
-                seconds_per_plane=0.01,
-            )
-            for length in lengths
-        )
-    )
+    return Evaluation(tuple(episode_of(each, is_success=success, distance_mm=distance_mm) for each in lengths))
 
 
 class ScriptedLearner:
@@ -320,6 +320,9 @@ def test_training_that_ends_early_goes_on_in_another_folder_as_its_own(tmp_path)
     assert {file.name: file.read_bytes() for file in first.iterdir()} == kept
     with pytest.raises(CheckpointError, match="is a checkpoint of run 'a', but this is 'b'"):
         take_over_checkpoints(ScriptedLearner(), first, second, theirs=own, own=own)
+    shutil.copyfile(second / LAST_CHECKPOINT, second / BEST_CHECKPOINT)
+    with pytest.raises(CheckpointError, match=r"best\.pt: is of epoch 4, but the best epoch of .*last\.pt is 2"):
+        take_over_checkpoints(ScriptedLearner(), second, first, theirs=own, own=own)
 
 
 def test_callbacks_that_have_started_end_although_a_later_one_cannot_start(tmp_path):

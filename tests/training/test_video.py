@@ -7,19 +7,12 @@ from PIL import Image
 
 from armscan.envs import make_armscan_env
 from armscan.training import VideoRecorder, record_episode
-
-
-class Still:
-    def begin(self, *, seed, bounds):
-        pass
-
-    def act(self, observation, reward):
-        return np.array([-1.0])
+from tests.training.test_episode_results import Still
 
 
 def test_video_has_a_frame_for_the_start_and_for_every_step(phantom, tmp_path):
     env = make_armscan_env([phantom], max_steps=3, render_mode="rgb_array")
-    record_episode(Still(), env, tmp_path / "episode.gif", seed=0)
+    record_episode(Still(-1.0), env, tmp_path / "episode.gif", seed=0)
     with Image.open(tmp_path / "episode.gif") as video:
         # The last two frames show the same plane, but different steps.
         assert video.n_frames == 4

@@ -11,7 +11,7 @@ import requests
 
 from armscan.sweeps.storage.storage import open_storage
 from armscan.ui.servers import HOST, start_dashboard
-from tests.ui.test_ui import free_ports
+from tests.support.ports import free_port
 
 SECRET, CONTENTS = "secret", "nobody may see it"
 PATHS = ["../{}", "..%2f{}", "%2e%2e/{}", "a/../../{}", "/{}", "..\\{}", "{}%00", "....//{}"]
@@ -26,8 +26,7 @@ def dashboard(tmp_path_factory):
     study.ask()
     (folder / "artifacts").mkdir()
     (folder / SECRET).write_text(CONTENTS)
-    port, _ = free_ports()
-    return start_dashboard(storage, folder / "artifacts", port), study, folder
+    return start_dashboard(storage, folder / "artifacts", free_port()), study, folder
 
 
 def answer_to(address, method, path):

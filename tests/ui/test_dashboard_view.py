@@ -9,7 +9,7 @@ import pytest
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.dashboard import LOCAL_UI, note_run, table_of_seeds
 from armscan.ui.servers import start_dashboard
-from tests.ui.test_ui import free_ports
+from tests.support.ports import free_port
 
 MLFLOW = "http://127.0.0.1:5123"
 LEASE = {"worker": "here-1", "pid": 12, "started": "x", "beat": 3, "seed": 1, "env_steps": 700, "return": -8.123456}
@@ -45,8 +45,7 @@ def dashboard(tmp_path):
         note_run(trial, Store, "1", "1" * 32, tmp_path, table_of_seeds({0: {"mean_steps": 3.0}}))
         if not is_running:
             study.tell(trial, 1.0)
-        port, _ = free_ports()
-        address = start_dashboard(storage, tmp_path, port, mlflow=MLFLOW)
+        address = start_dashboard(storage, tmp_path, free_port(), mlflow=MLFLOW)
         with urllib.request.urlopen(f"{address}/api/studies", timeout=30) as answer:
             (summary,) = json.loads(answer.read())["study_summaries"]
         with urllib.request.urlopen(f"{address}/api/studies/{study._study_id}", timeout=30) as answer:
@@ -96,8 +95,7 @@ def test_studies_of_others_are_shown_as_they_are(dashboard):
 
 def fail_trial(storage, tmp_path, trial):
     """Press the button that fails a trial; return the trial afterwards."""
-    port, _ = free_ports()
-    address = start_dashboard(storage, tmp_path, port)
+    address = start_dashboard(storage, tmp_path, free_port())
     told = urllib.request.Request(
         f"{address}/api/trials/{trial._trial_id}/tell",
         json.dumps({"state": "fail"}).encode(),

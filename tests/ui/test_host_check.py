@@ -9,7 +9,7 @@ import pytest
 
 from armscan.sweeps.storage.storage import open_storage
 from armscan.ui.servers import HOST, start_dashboard
-from tests.ui.test_ui import free_ports
+from tests.support.ports import free_port
 
 FOREIGN = [
     {"Host": "attacker.example:{port}"},
@@ -33,8 +33,7 @@ def dashboard(tmp_path_factory):
     storage = open_storage(str(folder / "optuna.journal"))
     optuna.create_study(study_name="mine", storage=storage.optuna)
     (folder / "artifacts").mkdir()
-    port, _ = free_ports()
-    return start_dashboard(storage, folder / "artifacts", port), storage.optuna
+    return start_dashboard(storage, folder / "artifacts", free_port()), storage.optuna
 
 
 def status_of(address, method, path, headers, body=None):

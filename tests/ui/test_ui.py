@@ -8,7 +8,6 @@ import socket
 import sqlite3
 import subprocess
 import sys
-import time
 import urllib.request
 from contextlib import closing
 from pathlib import Path
@@ -24,29 +23,23 @@ from armscan.sweeps.storage.storage import open_storage
 from armscan.ui import servers
 from armscan.ui.servers import HOST
 from armscan.ui.show import last_judged
+from tests.support import FEW_VOLUMES
+from tests.support.ports import free_ports
 from tests.support.postgres import PASSWORD
-from tests.support.processes import processes_in
+from tests.support.processes import processes_in, start_run
+from tests.support.programs import imported_by
+from tests.support.waiting import wait_until
 
 SMALL = [
     *("-m", "sweep=sac_y", "study.name=small", "study.n_trials=3", "study.workers=1", "study.final_eval.top_k=0"),
-    *("study/pruner=none", "data.n_training=1", "data.n_validation=1", "data.n_test=1", "training.env_steps=600"),
+    *("study/pruner=none", *FEW_VOLUMES, "training.env_steps=600"),
     *("training.eval_every_env_steps=200", "training.validation_episodes=2", "env.max_steps=8", "agent.batch_size=32"),
     *("agent.learning_starts=100", "network.vector.hidden_sizes=[16]"),
 ]
 TRAINING = "sac-cluster-y-phantom-seed0"
-START_S, END_S = 150, 60
+END_S = 60
 PROGRAM = (sys.executable, "-m", "armscan", "ui")
 PORT_OPTIONS = ("--mlflow-port", "--dashboard-port")
-
-
-def free_ports(n=2):
-    sockets = [socket.socket() for _ in range(n)]
-    for each in sockets:
-        each.bind((HOST, 0))
-    ports = [each.getsockname()[1] for each in sockets]
-    for each in sockets:
-        each.close()
-    return ports
 
 
 def make_study(uri):
@@ -71,30 +64,16 @@ def experiments_at(address):
     return {each.name for each in MlflowClient(tracking_uri=address).search_experiments()}
 
 
-def wait_for(moment, timeout_s=END_S):
-    until_s = time.monotonic() + timeout_s
-    while not moment():
-        assert time.monotonic() < until_s
-        time.sleep(0.05)
-
-
 class Look:
     """The command as a person starts it, with ports of its own; ready when it says how to end it."""
 
     def __init__(self, folder, *words, **environment):
         self.folder, self.file = folder, folder / "printed"
-        mlflow_port, dashboard_port = free_ports()
+        mlflow_port, dashboard_port = free_ports(2)
         self.mlflow, self.dashboard = f"http://{HOST}:{mlflow_port}", f"http://{HOST}:{dashboard_port}"
-        with self.file.open("wb") as file:
-            self.process = subprocess.Popen(
-                [*PROGRAM, *words, f"--dashboard-port={dashboard_port}", f"--mlflow-port={mlflow_port}"],
-                cwd=folder,
-                env=os.environ | environment,
-                stdout=file,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
-            )
-        wait_for(lambda: "Ctrl-C ends" in self.printed or self.process.poll() is not None, START_S)
+        words = [*words, f"--dashboard-port={dashboard_port}", f"--mlflow-port={mlflow_port}"]
+        self.process = start_run(*words, cwd=folder, command=PROGRAM, environment=environment)
+        wait_until(lambda: "Ctrl-C ends" in self.printed or self.process.poll() is not None)
 
     @property
     def printed(self):
@@ -121,7 +100,7 @@ def look():
     for each in looks:
         each.process.kill()
         each.process.wait()
-        wait_for(lambda folder=each.folder: processes_in(folder) == [])
+        wait_until(lambda folder=each.folder: processes_in(folder) == [])
 
 
 @pytest.fixture(scope="module")
@@ -185,7 +164,7 @@ def test_ui_names_a_port_that_is_taken_and_starts_nothing(both, monkeypatch, cap
     monkeypatch.chdir(both)
     with socket.create_server((HOST, 0)) as taken:
         port = taken.getsockname()[1]
-        others = [f"{other}={free}" for other, free in zip(PORT_OPTIONS, free_ports(), strict=True) if other != option]
+        others = [f"{other}={free}" for other, free in zip(PORT_OPTIONS, free_ports(2), strict=True) if other != option]
         assert main(["ui", f"{option}={port}", *others]) == 2
     printed = capsys.readouterr()
     assert printed.err == f"error: {option} is {port}, but {HOST}:{port} cannot be used (address already in use)\n"
@@ -213,7 +192,7 @@ def test_ui_shows_what_is_there_until_it_is_interrupted(both, look):
     assert "mine" in experiments_at(looked.mlflow)
     assert looked.end() == 130
     assert looked.printed.endswith("Ctrl-C ends both\n\ninterrupted\n")
-    wait_for(lambda: processes_in(both) == [])
+    wait_until(lambda: processes_in(both) == [])
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
@@ -221,7 +200,7 @@ def test_ui_takes_its_servers_along_when_it_is_killed(both, look, number):
     looked = look(both)
     assert len(looked.servers) == 2
     assert looked.end(number) == -number
-    wait_for(lambda: processes_in(both) == [])
+    wait_until(lambda: processes_in(both) == [])
 
 
 def test_ui_ends_and_says_so_when_mlflow_ends_by_itself(both, look):
@@ -232,7 +211,7 @@ def test_ui_ends_and_says_so_when_mlflow_ends_by_itself(both, look):
     said = looked.printed.partition("Ctrl-C ends both\n")[2]
     assert said.endswith("error: MLflow has ended by itself, with exit code -9; the end of its log is above\n")
     assert "Traceback" not in said
-    wait_for(lambda: processes_in(both) == [])
+    wait_until(lambda: processes_in(both) == [])
 
 
 def test_ui_shows_the_end_of_the_log_of_a_server_that_cannot_start(both, tmp_path, look):
@@ -249,11 +228,11 @@ def test_ui_shows_the_end_of_the_log_of_a_server_that_cannot_start(both, tmp_pat
 def test_ui_tells_of_a_server_that_does_not_answer_in_time(both, monkeypatch, capsys):
     monkeypatch.chdir(both)
     monkeypatch.setattr(servers, "START_S", 0.0)
-    assert main(["ui", *(f"{option}={port}" for option, port in zip(PORT_OPTIONS, free_ports(), strict=True))]) == 2
+    assert main(["ui", *(f"{option}={port}" for option, port in zip(PORT_OPTIONS, free_ports(2), strict=True))]) == 2
     assert capsys.readouterr().err.endswith(
         "error: MLflow does not answer within 0 s of its start; the end of its log is above\n"
     )
-    wait_for(lambda: processes_in(both) == [os.getpid()])
+    wait_until(lambda: processes_in(both) == [os.getpid()])
 
 
 @pytest.mark.parametrize(
@@ -286,7 +265,7 @@ def test_dashboard_shows_trials_that_come_later(tmp_path, look, storage, study_i
     looked = look(tmp_path, f"--storage={uri}")
     assert n_trials() == 2
     make_study(uri)
-    wait_for(lambda: n_trials() == 4)
+    wait_until(lambda: n_trials() == 4)
 
 
 def test_ui_leaves_runs_to_the_server_that_keeps_them(both, look):
@@ -321,11 +300,8 @@ def test_ui_shows_what_is_in_postgresql_and_no_password(postgres, tmp_path, look
 
 
 def test_ui_loads_nothing_that_trains_or_tracks_before_it_has_to():
-    program = (
-        "import sys, armscan.cli.main, armscan.ui.show\n"
-        "print([m for m in ('torch', 'mlflow', 'optuna', 'sqlalchemy') if m in sys.modules])"
-    )
-    assert subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout == "[]\n"
+    loaded = imported_by("import armscan.cli.main, armscan.ui.show")
+    assert not loaded & {"torch", "mlflow", "optuna", "sqlalchemy"}
 
 
 @pytest.fixture

@@ -1,6 +1,7 @@
 """Files that are written whole or not at all, and folders locked by one process."""
 
 import errno
+import os
 import subprocess
 import sys
 
@@ -43,6 +44,21 @@ def test_link_is_replaced_and_not_the_file_that_a_stranger_lets_it_lead_to(tmp_p
         assert not (tmp_path / "link").is_symlink()
     assert sorted(file.name for file in tmp_path.iterdir()) == ["link", "target"]
     assert (tmp_path / "target").read_bytes() == b"old"
+
+
+def test_links_that_were_laid_where_a_file_is_made_first_are_not_followed(tmp_path, monkeypatch):
+    names = (f".a.{os.getpid()}.unfinished", ".a.drawn.unfinished")
+    for name in names:
+        (tmp_path / name).symlink_to(tmp_path / "precious")
+    atomic_write(tmp_path / "a", lambda file: file.write(b"new"))
+    check_writable(tmp_path / "a")
+    monkeypatch.setattr("armscan.utils.files.token_hex", lambda _: "drawn")
+    with pytest.raises(FileExistsError):
+        check_writable(tmp_path / "a")
+    with pytest.raises(FileExistsError):
+        atomic_write(tmp_path / "a", lambda file: file.write(b"newer"))
+    assert (tmp_path / "a").read_bytes() == b"new"
+    assert not (tmp_path / "precious").exists()
 
 
 def test_unfinished_files_of_a_killed_writer_are_removed(tmp_path):

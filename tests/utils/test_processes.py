@@ -4,11 +4,9 @@ import gc
 import os
 import subprocess
 import threading
-from pathlib import Path
 
 from armscan.utils.processes import child_command, n_usable_cores, no_garbage_collection, on_parent_exit
-
-ROOT = Path(__file__).parents[2]
+from tests.support import REPOSITORY
 
 
 def print_threshold(parent_pid):
@@ -17,7 +15,7 @@ def print_threshold(parent_pid):
 
 def test_child_runs_its_function_and_collects_garbage_rarely():
     command = child_command("tests.utils.test_processes", print_threshold.__name__)
-    ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    ended = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=True)
     assert ended.stdout == f"threshold 50000 parent {os.getpid()}\n"
 
 

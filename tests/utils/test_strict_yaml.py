@@ -38,10 +38,20 @@ def test_mapping_with_a_key_twice_and_collection_in_itself_are_refused(text):
 
 
 def test_nesting_is_bounded():
-    # The document itself is the first level.
-    assert load_yaml("[" * (DEEPEST - 1) + "]" * (DEEPEST - 1))
+    assert load_yaml("[" * DEEPEST + "]" * DEEPEST)
     with pytest.raises(ValueError, match=f"more than {DEEPEST} deep"):
-        load_yaml("[" * DEEPEST + "]" * DEEPEST)
+        load_yaml("[" * (DEEPEST + 1) + "]" * (DEEPEST + 1))
+
+
+@pytest.mark.parametrize("text", ["0x" + "F" * 6000, "1:" * 5000 + "1", "+1_" + "0" * 6000, f'!!int " {"1:" * 5000}1"'])
+def test_long_numbers_are_refused_before_they_are_computed(text):
+    with pytest.raises(ValueError, match=r"\.\.\. has \d+ characters, but a number has at most 1000"):
+        load_yaml(f"a: {text}")
+
+
+def test_long_text_is_read():
+    words, digits = "9 words, " * 200 + "end", "1" * 6000
+    assert load_yaml(yaml.safe_dump([words, digits])) == [words, digits]
 
 
 @pytest.mark.parametrize("width", [2, 9])

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from armscan.errors import ArmscanError
 from armscan.volumes import LabelMap, LabelVolume, ManipulatorAction, open_dataset, read_volume, record_planes
 from tests.conftest import make_tiny_volume
+from tests.volumes.test_reading import FORMATS
 from tests.volumes.test_segmentation import NAMES, write_segmentation
 
-PLAIN = ["wrist.nii", "wrist.nii.gz", "wrist.nrrd", "wrist.mha", "wrist.mhd"]
-FILES = [*PLAIN, "wrist.seg.nrrd", "layers.seg.nrrd"]
+FILES = [*FORMATS, "wrist.seg.nrrd", "layers.seg.nrrd"]
 SETTINGS = settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 # Anything that somebody might pass.
@@ -65,18 +65,29 @@ def is_sound(volume):
     )
 
 
+def write_whole(path, *, is_compressed=False):
+    """Write the tiny volume as a file of the kind that its name says."""
+    import SimpleITK
+
+    labels = make_tiny_volume().labels
+    if path.name == "wrist.seg.nrrd":
+        write_segmentation(path, labels, [(name, 0, label) for label, name in enumerate(NAMES, 1)])
+    elif path.name == "layers.seg.nrrd":
+        layers = np.stack([labels == label for label in (1, 2, 3)]).astype(np.uint8)
+        write_segmentation(path, layers, [(name, layer, 1) for layer, name in enumerate(NAMES)])
+    else:
+        image = SimpleITK.GetImageFromArray(np.ascontiguousarray(labels.T).astype(np.int16))
+        image.SetSpacing((0.5, 0.7, 0.9))
+        image.SetOrigin((1.0, -2.0, 3.0))
+        SimpleITK.WriteImage(image, str(path), is_compressed)
+
+
 @pytest.fixture(scope="module")
 def whole_files(tmp_path_factory):
     """Return the bytes of one whole file of each kind, by name."""
-    import SimpleITK
-
-    folder, volume = tmp_path_factory.mktemp("whole"), make_tiny_volume()
-    image = SimpleITK.GetImageFromArray(np.ascontiguousarray(volume.labels.T).astype(np.int16))
-    for name in PLAIN:
-        SimpleITK.WriteImage(image, str(folder / name))
-    layers = np.stack([volume.labels == label for label in (1, 2, 3)]).astype(np.uint8)
-    write_segmentation(folder / FILES[5], volume.labels, [(name, 0, i) for i, name in enumerate(NAMES, 1)])
-    write_segmentation(folder / FILES[6], layers, [(name, i, 1) for i, name in enumerate(NAMES)])
+    folder = tmp_path_factory.mktemp("whole")
+    for name in FILES:
+        write_whole(folder / name)
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 

@@ -28,7 +28,7 @@ NRRD = (
 )
 
 
-def nifti(n, begin=352.0, magic=b"n+1\0", place=0.0):
+def nifti(n, begin=352.0, magic=b"n+1\0", place=1.0):
     """Return the header of a NIfTI file of n x n x n bytes."""
     header = bytearray(352)
     struct.pack_into("<i", header, 0, 348)
@@ -122,6 +122,8 @@ VOXELS = np.ascontiguousarray(make_tiny_volume().labels[:10, :10, :10].T).tobyte
         (nifti(10, magic=bytes(4)), "of a pair of files (.hdr and .img), which is not read"),
         (nifti(10, place=float("nan")), "its place in the world (qform, sform) holds a NaN"),
         (nifti(10, place=float("inf")), "its place in the world (qform, sform) holds a NaN"),
+        (nifti(10, place=1.01), "the spacing is (1, 1, 1) by pixdim, but (1.01, 1, 1) by the sform"),
+        (nifti(10, place=-0.99), "the spacing is (1, 1, 1) by pixdim, but (0.99, 1, 1) by the sform"),
     ],
 )
 @pytest.mark.parametrize("name", ["a.nii", "a.nii.gz"])

@@ -5,15 +5,15 @@ import math
 import multiprocessing
 import re
 from dataclasses import fields
-from pathlib import Path
 
 import pytest
 import yaml
 
 from armscan.errors import InvalidValueError, ManifestError
 from armscan.volumes import LabelMap, ManipulatorAction, open_dataset, record_planes
+from tests.support import REPOSITORY
+from tests.volumes.test_dataset import PLANE
 
-PLANE = {"rotation": [1.5, -0.5], "translation": [0.0, 7.0]}
 NAMES = ["manifest.yaml", "manifest.yml", "manifest.json"]
 
 
@@ -180,6 +180,29 @@ def test_record_planes_tells_entries_apart_that_yaml_has_as_one(folder):
     assert dataset.subjects == {"a.nii.gz": "S1", "b.nrrd": "S1"}
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "volumes:\n  a.nii.gz: &one\n    subject: S1  # left\n  b.nrrd: {<<: *one}\n",
+        "volumes:\n  b.nrrd: {<<: &one {subject: S1}}\n  a.nii.gz: *one\n",
+    ],
+)
+def test_record_planes_gives_a_plane_to_no_entry_that_merges_the_labelled_one(folder, text):
+    record_planes(written(folder, text), {"a.nii.gz": (ACTION, -0.01)})
+    dataset = open_dataset(folder)
+    assert dataset.volumes["a.nii.gz"].optimal_action == ACTION
+    assert dataset.volumes["b.nrrd"].optimal_action is None
+    assert dataset.subjects == {"a.nii.gz": "S1", "b.nrrd": "S1"}
+
+
+def test_record_planes_writes_nothing_that_would_be_read_otherwise(folder):
+    # ruamel.yaml loses the braces of a mapping with an anchor in a list of merged ones.
+    text = "volumes:\n  b.nrrd: {<<: [&one {subject: S1}, {axes: xyz}]}\n  a.nii.gz: *one\n"
+    with pytest.raises(ManifestError, match=r"cannot be written .*: write them out"):
+        record_planes(written(folder, text), {"b.nrrd": (ACTION, -0.01)})
+    assert (folder / "manifest.yaml").read_text() == text
+
+
 def test_record_planes_keeps_comments_and_small_numbers(folder):
     written(folder, "# ours\nvolumes:\n  a.nii.gz:\n    subject: 'S1'  # left\n    score: -0.5\n  b.nrrd: {}\n")
     action = ManipulatorAction((0.0, 0.0), (1e-05, 2.0))
@@ -225,7 +248,7 @@ def test_manifest_page_names_every_key_and_its_example_is_one(tmp_path):
     from armscan.volumes.manifest import read_manifest
     from armscan.volumes.manifest_schema import Manifest, Splits, VolumeEntry
 
-    page = (Path(__file__).parents[2] / "docs" / "manifest.md").read_text()
+    page = (REPOSITORY / "docs" / "manifest.md").read_text()
     keys = [
         *Manifest.model_fields,
         *VolumeEntry.model_fields,
@@ -266,6 +289,37 @@ def test_record_planes_writes_through_a_link_and_keeps_its_permissions(folder, t
     assert (folder / "manifest.yaml").is_symlink()
     assert "19.0" in elsewhere.read_text()
     assert elsewhere.stat().st_mode & 0o777 == 0o640
+
+
+@pytest.mark.parametrize("target", ["missing.yaml", "profile"])
+def test_link_of_a_stranger_makes_and_changes_no_file_of_the_user(folder, tmp_path_factory, target):
+    home = tmp_path_factory.mktemp("home")
+    (home / "profile").write_text("# empty so far\n")
+    (folder / "manifest.yaml").symlink_to(home / target)
+    with pytest.raises(ManifestError, match=r"manifest\.yaml: is a link to .*, but") as caught:
+        record_planes(folder, {"a.nii.gz": (ACTION, 0.0)})
+    assert str(home / target) in str(caught.value)
+    assert [(file.name, file.read_text()) for file in home.iterdir()] == [("profile", "# empty so far\n")]
+
+
+def test_lock_of_a_folder_may_be_held_by_every_user_of_the_cache(folder, tmp_path, monkeypatch):
+    cache = tmp_path / "cache"
+    monkeypatch.setenv("ARMSCAN_CACHE", str(cache))
+    record_planes(folder, {"a.nii.gz": (ACTION, 0.0)})
+    (lock,) = cache.glob("*.lock")
+    assert lock.stat().st_mode & 0o777 == 0o666
+    lock.unlink()
+    lock.mkdir()
+    with pytest.raises(ManifestError, match=r"\.lock: the manifest of .* cannot be locked \(Is a directory"):
+        record_planes(folder, {"a.nii.gz": (ACTION, 0.0)})
+
+
+@pytest.mark.parametrize("number", ["0x" + "F" * 900, "0x" + "F" * 6000, "1:" * 400 + "1", "1:" * 5000 + "1"])
+def test_manifest_with_a_huge_number_is_refused_in_one_line(folder, number):
+    for key in ("subject", "score", "rotation"):
+        with pytest.raises(ManifestError) as caught:
+            open_dataset(written(folder, f"volumes: {{b.nrrd: {{{key}: {number}}}, a.nii.gz: {{{key}: [{number}]}}}}"))
+        assert len(str(caught.value)) < 2000
 
 
 def test_manifest_that_is_no_yaml_is_answered_with_the_place(folder):

@@ -16,6 +16,7 @@ from armscan.errors import InvalidValueError
 from armscan.volumes import ManipulatorAction
 from armscan.volumes.mapped import MAGIC, kept_if_possible, limit_bytes, mapped_volume, open_mapped
 from tests.conftest import make_tiny_volume
+from tests.support import REPOSITORY
 
 ABOUT = {"orientation": "LPS", "found": [1, "bones"]}
 TURNED = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -56,7 +57,7 @@ def never():
     raise AssertionError("made again")
 
 
-def assert_same(one, other):
+def assert_same_volume(one, other):
     np.testing.assert_array_equal(one.labels, other.labels)
     np.testing.assert_array_equal(one.direction, other.direction)
     for name in ("spacing", "name", "optimal_action", "origin", "fingerprint", "shape", "centre_mm"):
@@ -66,7 +67,7 @@ def assert_same(one, other):
 def test_mapped_volume_is_found_as_it_was_made(path, volume):
     for make in (lambda: (volume, ABOUT), never):
         found, about = mapped_volume(path, make)
-        assert_same(found, volume)
+        assert_same_volume(found, volume)
         assert about == ABOUT
         assert not found.labels.flags.writeable
         assert not found.direction.flags.writeable
@@ -103,16 +104,16 @@ def test_file_that_is_damaged_anywhere_is_none(path, kept):
 
 def test_damaged_file_is_replaced_by_what_is_made(path, kept, volume):
     path.write_bytes(kept[:-1] + b"\7")
-    assert_same(mapped_volume(path, lambda: (volume, ABOUT))[0], volume)
+    assert_same_volume(mapped_volume(path, lambda: (volume, ABOUT))[0], volume)
     assert path.read_bytes() == kept
 
 
 def test_process_that_is_killed_while_writing_leaves_nothing_under_the_name(path, volume):
-    ended = subprocess.run([sys.executable, "-c", KILLED, str(path)], check=False, cwd=Path(__file__).parents[2])
+    ended = subprocess.run([sys.executable, "-c", KILLED, str(path)], check=False, cwd=REPOSITORY)
     assert ended.returncode == -9
     (left,) = path.parent.glob(".*unfinished")
     assert not path.exists()
-    assert_same(mapped_volume(path, lambda: (volume, ABOUT))[0], volume)
+    assert_same_volume(mapped_volume(path, lambda: (volume, ABOUT))[0], volume)
     # Another process may still be writing a recent one.
     assert left.exists()
     os.utime(left, (0, 0))
@@ -131,7 +132,7 @@ def test_many_at_once_make_a_volume_once(path, volume):
         found = list(threads.map(lambda _: mapped_volume(path, make), range(4)))
     assert len(made) == 1
     for each, _ in found:
-        assert_same(each, volume)
+        assert_same_volume(each, volume)
 
 
 def test_those_that_nobody_has_opened_for_longest_make_way(path, kept, volume, monkeypatch):
@@ -148,7 +149,7 @@ def test_those_that_nobody_has_opened_for_longest_make_way(path, kept, volume, m
     mapped_volume(paths[1], lambda: (volume, ABOUT))
     assert [each.exists() for each in (*paths, path)] == [False, True, False, False]
     # A removed file that is still mapped stays readable.
-    assert_same(opened, volume)
+    assert_same_volume(opened, volume)
 
 
 @pytest.mark.parametrize("word", ["-1", "nan", "much"])

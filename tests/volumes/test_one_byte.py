@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 
 from armscan.volumes import read_volume
 from tests.conftest import make_tiny_volume
-from tests.volumes.test_damaged import refuses
-from tests.volumes.test_segmentation import NAMES, write_segmentation
+from tests.volumes.test_damaged import refuses, write_whole
 
 SETTINGS = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 # By key, each with a folder of its own: the file to read, and in DAMAGED the file to damage if it is another one.
@@ -31,22 +30,9 @@ N_VOXEL_BYTES = make_tiny_volume().labels.size * 2
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory):
     """Return a folder with one whole file for each key of `FILES`."""
-    import SimpleITK
-
-    labels = make_tiny_volume().labels
-    image = SimpleITK.GetImageFromArray(np.ascontiguousarray(labels.T).astype(np.int16))
-    image.SetSpacing((0.5, 0.7, 0.9))
-    image.SetOrigin((1.0, -2.0, 3.0))
-    folders = {}
-    for key, name in FILES.items():
-        folders[key] = folder = tmp_path_factory.mktemp("stored")
-        if key in PLAIN | COMPRESSED:
-            SimpleITK.WriteImage(image, str(folder / name), key in COMPRESSED)
-    layers = np.stack([labels == label for label in (1, 2, 3)]).astype(np.uint8)
-    write_segmentation(
-        folders["seg"] / FILES["seg"], np.where(labels < 4, labels, 0), [(n, 0, i) for i, n in enumerate(NAMES, 1)]
-    )
-    write_segmentation(folders["layers"] / FILES["layers"], layers, [(n, i, 1) for i, n in enumerate(NAMES)])
+    folders = {key: tmp_path_factory.mktemp("stored") for key in FILES}
+    for key, folder in folders.items():
+        write_whole(folder / FILES[key], is_compressed=key in COMPRESSED)
     return folders
 
 

@@ -47,11 +47,16 @@ def test_phantom_optimal_plane_is_rewarded(wrist):
 
 
 def test_phantom_of_version_2_is_rewarded_and_of_both_hands():
+    are_left = []
     for seed in range(12):
         volume = load_phantom(seed, version=2)
         clusters = TissueClusters.from_slice(volume.slice(volume.optimal_action))
         assert landmark_reward(clusters) > -0.05
         assert set(np.unique(volume.labels)) == {0, 1, 2, 3, 4}
+        # The artery runs along the side of the little finger.
+        are_left.append(clusters.artery.mean_centre[0] < clusters.tendons.mean_centre[0])
+    assert are_left == [Pose.draw(np.random.default_rng(seed)).left for seed in range(12)]
+    assert set(are_left) == {True, False}
 
 
 def test_phantoms_of_version_2_differ_in_where_the_labelled_plane_cuts_the_carpus():

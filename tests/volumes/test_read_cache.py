@@ -2,14 +2,14 @@
 
 import gzip
 import json
+from importlib.metadata import version
 
-import numpy as np
 import pytest
 
 from armscan.errors import VolumeError
-from armscan.volumes import open_dataset, reading
-
-PLANE = {"rotation": [1.5, -0.5], "translation": [0.0, 7.0]}
+from armscan.volumes import open_dataset, read_cache, reading
+from tests.volumes.test_dataset import PLANE
+from tests.volumes.test_mapped import assert_same_volume
 
 
 @pytest.fixture
@@ -24,11 +24,7 @@ def n_read(monkeypatch, tmp_path):
 def assert_same(one, other):
     assert one.reports.keys() == other.reports.keys()
     for name, volume in one.volumes.items():
-        its_like = other.volumes[name]
-        np.testing.assert_array_equal(volume.labels, its_like.labels)
-        np.testing.assert_array_equal(volume.direction, its_like.direction)
-        for attribute in ("name", "spacing", "origin", "optimal_action", "fingerprint"):
-            assert getattr(volume, attribute) == getattr(its_like, attribute)
+        assert_same_volume(volume, other.volumes[name])
         assert one.reports[name].stored == other.reports[name].stored
 
 
@@ -78,6 +74,20 @@ def test_file_is_read_anew_where_it_has_changed(write_labelmap, write_manifest, 
     assert n_read() == 3
 
 
+@pytest.mark.parametrize("package", ["SimpleITK", "slicerio", "pynrrd"])
+def test_file_is_read_anew_by_another_version_of_its_readers(
+    package, write_labelmap, write_manifest, n_read, monkeypatch
+):
+    write_labelmap("a.nii.gz")
+    folder = write_manifest({"a.nii.gz": PLANE})
+    open_dataset(folder)
+    read_cache._code_version.cache_clear()
+    monkeypatch.setattr(read_cache, "version", lambda name: "99" if name == package else version(name))
+    open_dataset(folder)
+    read_cache._code_version.cache_clear()
+    assert n_read() == 2
+
+
 def test_damaged_cache_is_not_believed(write_labelmap, write_manifest, n_read, tmp_path):
     write_labelmap("a.nii.gz")
     folder = write_manifest({"a.nii.gz": PLANE})
@@ -117,8 +127,6 @@ def test_nrrd_with_voxels_in_another_file_is_read_each_time(header, write_manife
 
 
 def test_resampled_volumes_are_kept(write_labelmap, n_read, monkeypatch, tmp_path):
-    from armscan.volumes import read_cache
-
     write_labelmap("a.nii.gz")
     write_labelmap("b.nii.gz", spacing=(0.3, 0.4, 0.25))
     manifest = {"spacing": "finest", "volumes": {"a.nii.gz": PLANE, "b.nii.gz": PLANE}}

@@ -7,10 +7,7 @@ from hypothesis import strategies as st
 
 from armscan.errors import InvalidValueError
 from armscan.volumes import ManipulatorAction, RigidTransform
-
-moderate_deg = st.floats(-80, 80)
-any_mm = st.floats(-100, 100)
-actions = st.builds(ManipulatorAction, st.tuples(moderate_deg, moderate_deg), st.tuples(any_mm, any_mm))
+from tests.volumes.test_plane import actions, any_mm, moderate_deg
 
 
 @pytest.mark.parametrize("bad", [{"rotation": 3}, {"translation": (1, 2, 3)}, {"centre_mm": (1, 2)}])

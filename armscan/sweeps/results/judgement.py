@@ -36,6 +36,8 @@ from armscan.utils.markdown import markdown_table
 from armscan.utils.rate_text import PERCENT, formatted
 
 MAXIMIZE = "maximize"
+# Prefixes of the metrics of a study's run that compare the chosen configuration with the control.
+COMPARISONS = ("difference", "probability_of_improvement")
 HOW = (
     "A difference is the mean of the paired differences over all seeds and test volumes; its interval is for other "
     "seeds and volumes. The probability of improvement is the probability that a training of the chosen configuration "
@@ -196,6 +198,8 @@ def judge(final: FinalEvaluation) -> Judgement | None:
 def best_metrics(search: optuna.Study, judgement: Judgement | None) -> dict[str, float]:
     """Return the leading metrics of a study's best trial and of its result, by the names that runs use.
 
+    If the study went on after its end, differences that only an earlier result had are NaN: MLflow cannot delete them.
+
     Args:
         search: Study of the search.
         judgement: Its judgement; None without one.
@@ -211,11 +215,20 @@ def best_metrics(search: optuna.Study, judgement: Judgement | None) -> dict[str,
     if (of_random := chosen.baselines.get(RANDOM)) is not None:
         metrics = of_random.metrics()
         found |= {f"{RANDOM}/{name}": metrics[name] for name in leading_among(metrics)}
+    if judgement.others:
+        compared = (*(name for name in search.user_attrs[OBJECTIVES] if name in of_chosen), *leading_among(of_chosen))
+        found |= dict.fromkeys(
+            (name for key in COMPARISONS for each in compared for name in _names(key, each)), math.nan
+        )
     for each in judgement.differences:
-        for key, estimate in (("difference", each.paired), ("probability_of_improvement", each.probability)):
-            names = (f"{key}/{each.metric}{end}" for end in ("", *ENDS))
-            found |= dict(zip(names, estimate, strict=True))
+        for key, estimate in zip(COMPARISONS, (each.paired, each.probability), strict=True):
+            found |= dict(zip(_names(key, each.metric), estimate, strict=True))
     return found
+
+
+def _names(key: str, metric: str) -> list[str]:
+    """Return the names of an estimate and of the ends of its interval."""
+    return [f"{key}/{metric}{end}" for end in ("", *ENDS)]
 
 
 def result_note(judgement: Judgement | None) -> str:

@@ -39,11 +39,6 @@ class ConfigResult:
     figures: MetricEstimates
     baselines: Mapping[str, MetricEstimates]
 
-    @property
-    def n_seeds(self) -> int:
-        """The number of final trainings."""
-        return self.figures.n_seeds
-
 
 def values_of(trial: FrozenTrial, objectives: Iterable[str]) -> str:
     """Return the values of a trial with the names of the objectives, as a string."""

@@ -10,8 +10,8 @@ from armscan.sweeps.scheduling.state import StudyState
 from armscan.sweeps.storage.attribute_names import TERMINATED
 from armscan.sweeps.storage.storage import Storage
 
-# Keys of the attribute of a study that has ended.
-REASON, ASKED = "reason", "asked"
+# Keys of the attribute of a study that has ended; of one that was reopened since, the number of its finished trials.
+REASON, ASKED, N_FINISHED = "reason", "asked", "n_finished"
 
 
 class Termination:
@@ -43,13 +43,35 @@ class Termination:
         if n_seen == self._n_seen:
             return
         self._n_seen = n_seen
-        if self.reason is None and (reason := self._find_reason(state)) is not None:
+        # The rule that ended a study is still fulfilled when that is reopened.
+        is_new = n_seen > self._study.user_attrs.get(TERMINATED, {}).get(N_FINISHED, -1)
+        if is_new and self.reason is None and (reason := self._find_reason(state)) is not None:
             self._storage.exclusive(lambda: self._keep(reason))
 
     def _keep(self, reason: str) -> None:
         # Another worker may have found it, too: the first counts.
         if self.reason is None:
             self._study.set_user_attr(TERMINATED, {REASON: reason, ASKED: self._asked})
+
+
+def reopen(study: optuna.Study, storage: Storage, asked: str) -> bool:
+    """Reopen a study that has ended before its last trial, if something else is asked for; return whether it was.
+
+    Args:
+        study: The study in its storage.
+        storage: The storage.
+        asked: See `Termination`.
+    """
+
+    def reopened() -> bool:
+        ended = study.user_attrs.get(TERMINATED, {})
+        if REASON not in ended or ended.get(ASKED) == asked:
+            return False
+        finished = StudyState.of(study.get_trials(deepcopy=False)).finished
+        study.set_user_attr(TERMINATED, {N_FINISHED: len(finished)})
+        return True
+
+    return storage.exclusive(reopened)
 
 
 def ended_because(study: optuna.Study, asked: str) -> str | None:

@@ -41,6 +41,12 @@ class _Attributes(Section):
     model_config = ConfigDict(extra="ignore", strict=True, frozen=True)
 
 
+class _Terminated(_Attributes):
+    reason: Text = ""
+    asked: Text = ""
+    n_finished: Number = 0
+
+
 class StudyAttributes(_Attributes):
     """User attributes of a study, named as in `attribute_names`."""
 
@@ -51,7 +57,7 @@ class StudyAttributes(_Attributes):
     note_sha256: Text = ""
     stop: Text = ""
     forgiven: list[Number] = Field(default=[], description="a list of numbers of trials")
-    terminated: dict[str, Text] = Field(default={}, description="strings by their names")
+    terminated: _Terminated = Field(default=_Terminated(), description="how the study has ended")
     begun_with: list[Text] = Field(default=[], description="a list of strings")
 
 

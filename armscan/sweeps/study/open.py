@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -24,7 +24,7 @@ from armscan.sweeps.study.final_eval import FinalEvaluation, training_of
 from armscan.sweeps.study.phase import OpenedStudy, Phase
 from armscan.sweeps.study.population import population_of
 from armscan.sweeps.study.settings import StudySettings
-from armscan.sweeps.study.study import make_study, name_objectives
+from armscan.sweeps.study.study import fixed_config, make_study, name_objectives
 from armscan.sweeps.study.warm_start import values_of
 from armscan.sweeps.tasks.attempt import Task
 from armscan.tracking import TrackingStore, open_store, run_of_study, source
@@ -35,7 +35,13 @@ NO_END = 10**9
 
 
 def open_for_work(
-    settings: StudySettings, task: Task, config: DictConfig, overrides: Sequence[str], *, retry: bool = False
+    settings: StudySettings,
+    task: Task,
+    config: DictConfig,
+    overrides: Sequence[str],
+    *,
+    volumes: Mapping[str, str] | None = None,
+    retry: bool = False,
 ) -> OpenedStudy:
     """Open a study, and create it if there is none.
 
@@ -44,6 +50,7 @@ def open_for_work(
         task: Task of its trials.
         config: Configuration of its trials without the searched values.
         overrides: Overrides that its trials are composed from.
+        volumes: Checksums of its volumes; see `volume_sums`. Default: None, they are not compared.
         retry: Whether to wait for a store or a storage that is unavailable. Default: False.
 
     Raises:
@@ -55,7 +62,7 @@ def open_for_work(
     for folder in (settings.folder, settings.artifacts):
         Path(folder).mkdir(parents=True, exist_ok=True)
     storage = open_storage(settings.storage, retry=retry)
-    study = make_study(storage, settings, to_plain(config))
+    study = make_study(storage, settings, fixed_config(config, overrides, volumes))
     objectives = tuple(settings.objectives)
     population = population_of(settings, config)
     plan = None if population is None else lambda: population.plan(study.get_trials(deepcopy=False))

@@ -8,12 +8,14 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 from optuna.samplers import BaseSampler
 
+from armscan.agents.hyperparameters import round_up
 from armscan.agents.schedule import AGENT
-from armscan.errors import InvalidValueError, listed
+from armscan.errors import InvalidValueError, few, listed
 from armscan.sweeps.scheduling.population import Population, PopulationSampler
 from armscan.sweeps.study.components import make
 from armscan.sweeps.study.settings import NO_PRUNER, StudySettings
 from armscan.sweeps.tasks.training import TrainingTask
+from armscan.utils.validation import check_int
 
 WITH = "population-based training (study/sampler=pbt) requires"
 
@@ -59,8 +61,9 @@ def _check(settings: StudySettings, config: DictConfig, sampler: PopulationSampl
     for key in ("solved", "schedule"):
         if config.training.get(key) is not None:
             raise InvalidValueError(f"{WITH} training.{key}=null")
-    _check_interval(config, sampler.interval_env_steps)
-    allowed = [f"{AGENT}{name}" for name in getattr(instantiate(config.agent), "SCHEDULABLE", ())]
+    algorithm = instantiate(config.agent)
+    _check_interval(config, algorithm, sampler.interval_env_steps)
+    allowed = [f"{AGENT}{name}" for name in getattr(algorithm, "SCHEDULABLE", ())]
     for parameter in settings.space.parameters:
         if parameter.name not in allowed:
             raise InvalidValueError(
@@ -70,20 +73,37 @@ def _check(settings: StudySettings, config: DictConfig, sampler: PopulationSampl
             raise InvalidValueError(f"study.space.{parameter.name}.when: {WITH} keys that are always searched")
 
 
-def _check_interval(config: DictConfig, interval: int) -> None:
-    """Raise `InvalidValueError` if generations do not divide the training, or one of them could have no epoch."""
-    total, epoch = config.training.env_steps, config.training.eval_every_env_steps
-    name = "study.sampler.interval_env_steps"
+def _check_interval(config: DictConfig, algorithm: Any, interval: int) -> None:
+    """Raise `InvalidValueError` if generations do not divide the training, or one of them would have no epoch."""
+    total, name = config.training.env_steps, "study.sampler.interval_env_steps"
     if total % interval or total == interval:
         raise InvalidValueError(
             f"{name} is {interval}, but it must divide training.env_steps = {total} into two generations or more"
         )
-    agent: Any = config.agent
-    # An epoch has whole collections, and the first one also the steps before learning starts.
-    epoch = max(epoch, agent.get("env_steps_per_collection", 1))
-    first = agent.get("learning_starts", 0) + epoch
-    if interval < epoch or 2 * interval <= first:
+    epoch = check_int("training.eval_every_env_steps", config.training.eval_every_env_steps, at_least=1)
+    starts = _epoch_starts(algorithm, total, epoch)
+    longer = [total // n for n in range(total // interval, 1, -1) if total % n == 0]
+    fitting = [each for each in longer if len({start // each for start in starts}) == total // each]
+    if interval not in fitting:
         raise InvalidValueError(
-            f"{name} is {interval}, but it must be at least {max(epoch, first // 2 + 1)}, so that each generation has "
-            "an epoch (training.eval_every_env_steps, agent.learning_starts)"
+            f"{name} is {interval}, but an epoch must begin in each generation, and they begin at the environment "
+            f"steps {few(starts)} (training.eval_every_env_steps in whole collections, agent.learning_starts): give "
+            + (f"{name}={fitting[0]}" if fitting else "a smaller training.eval_every_env_steps")
         )
+
+
+def _epoch_starts(algorithm: Any, total: int, epoch: int) -> list[int]:
+    """Return the environment steps at which the epochs of a training begin.
+
+    Args:
+        algorithm: Algorithm, whose collections are never cut short.
+        total: Environment steps of the training.
+        epoch: Environment steps of an epoch, as configured.
+    """
+    # A plane finder plays whole episodes.
+    at_once = getattr(algorithm, "num_envs", 1) * getattr(algorithm, "n_looks", 1)
+    collection = round_up(getattr(algorithm, "env_steps_per_collection", 1), at_once)
+    starts = [round_up(getattr(algorithm, "learning_starts", 0), at_once)]
+    while (start := starts[-1] + round_up(min(epoch, total - starts[-1]), collection)) < total:
+        starts.append(start)
+    return starts

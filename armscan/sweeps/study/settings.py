@@ -146,7 +146,7 @@ class StudySettings(Limits):
         seed: Seed of the samplers.
         seeds: Training seeds of each trial, used one after another.
         final_eval: Final evaluation of the best configurations.
-        allow_config_changes: Whether to resume although the fixed configuration has changed.
+        allow_config_changes: Whether to resume although the fixed configuration, or the volumes, have changed.
     """
 
     name: Name

@@ -8,23 +8,29 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import optuna
+from omegaconf import DictConfig
 from optuna.exceptions import ExperimentalWarning
 from optuna.pruners import BasePruner
 from optuna.trial import FrozenTrial, TrialState
 
-from armscan.config.defaults import ADDED, NOT_COMPARED
+from armscan.config.defaults import ADDED, NOT_COMPARED, to_plain
 from armscan.config.legacy import migrate, renamed
 from armscan.errors import StudyError
 from armscan.sweeps.scheduling.population import searched_values
 from armscan.sweeps.scheduling.state import is_feasible
-from armscan.sweeps.storage.attribute_names import FIXED, GENERATION, OBJECTIVES, OF_STUDY, SPACE
+from armscan.sweeps.space.parameter import hydra_literal
+from armscan.sweeps.storage.attribute_names import FIXED, GENERATION, MEMBER, OBJECTIVES, OF_STUDY, SPACE
 from armscan.sweeps.storage.attributes import StudyAttributes, check_trials
 from armscan.sweeps.storage.storage import Storage
+from armscan.sweeps.study.arguments import STUDY, fixed_by
 from armscan.sweeps.study.components import make
 from armscan.sweeps.study.settings import StudySettings
 from armscan.tracking import flatten
 
 N_SHOWN = 5
+# Among the compared settings: the size and interval of a population, the overrides below a searched group, and a
+# checksum of the volumes. A study that lacks one, as those of earlier versions do, is not compared by it.
+LATER = POPULATION, OVERRIDES, VOLUMES = "study.population", "study.overrides", "study.volumes"
 
 
 def make_study(storage: Storage, settings: StudySettings, fixed: Mapping[str, Any]) -> optuna.Study:
@@ -33,7 +39,7 @@ def make_study(storage: Storage, settings: StudySettings, fixed: Mapping[str, An
     Args:
         storage: Storage of the study.
         settings: Settings of the study.
-        fixed: Configuration of its trials without the searched values.
+        fixed: Configuration of its trials without the searched values; see `fixed_config`.
 
     Raises:
         StudyError: If the study that exists searches another space, has other objectives, or has trials with another
@@ -57,7 +63,9 @@ def make_study(storage: Storage, settings: StudySettings, fixed: Mapping[str, An
 
     study = storage.exclusive(made)
     if _check_same(settings, study, wanted):
-        study.set_user_attr(FIXED, wanted[FIXED])
+        # The volumes are known to the command alone, not to its workers.
+        kept = {key: value for key, value in study.user_attrs[FIXED].items() if key.startswith(VOLUMES)}
+        study.set_user_attr(FIXED, kept | wanted[FIXED])
     name_objectives(study, list(settings.objectives))
     return study
 
@@ -88,12 +96,38 @@ def existing_study(storage: Storage | None, settings: StudySettings, fixed: Mapp
     return study
 
 
+def fixed_config(
+    config: DictConfig, overrides: Sequence[str], volumes: Mapping[str, str] | None = None
+) -> dict[str, Any]:
+    """Return all of a study's configuration that is compared when it is started again.
+
+    Args:
+        config: Configuration of its trials without the searched values.
+        overrides: Overrides that its trials are composed from.
+        volumes: Checksums of the volumes; see `volume_sums`. Default: None, they are not compared.
+    """
+    return to_plain(config) | {STUDY: {"overrides": fixed_by(overrides), "volumes": volumes or {}}}
+
+
 def comparable_settings(settings: StudySettings, fixed: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings that a study stores, which are compared when it is started again."""
+    names = [each.name for each in settings.space.parameters]
+    searched, not_compared = tuple(f"{name}." for name in names), tuple(f"{key}." for key in NOT_COMPARED)
+    given, sampler = fixed.get(STUDY, {}), settings.sampler
     of_trials: dict[str, Any] = {"study.seeds": list(settings.seeds), "study.task": settings.task["_target_"]}
     if settings.constraints:
         of_trials["study.constraints"] = list(map(str, settings.constraints))
-    left_out = tuple(f"{each}." for each in (*NOT_COMPARED, *(one.name for one in settings.space.parameters)))
+    is_population = "interval_env_steps" in sampler
+    of_trials[POPULATION] = [sampler.get("population"), sampler["interval_env_steps"]] if is_population else None
+    # A trial chooses all other keys of a searched group.
+    of_trials[OVERRIDES] = [
+        f"{key}={hydra_literal(value)}"
+        for key, value in sorted(given.get("overrides", {}).items())
+        if f"{key}.".startswith(searched) and not f"{key}.".startswith(not_compared)
+    ]
+    if not any(f"{name}.".startswith("data.") for name in names):
+        of_trials |= {f"{VOLUMES}.{part}": volumes for part, volumes in given.get("volumes", {}).items()}
+    left_out = (*not_compared, *searched, f"{STUDY}.")
     shared = {key: value for key, value in flatten(fixed).items() if not f"{key}.".startswith(left_out)}
     shared = {key: value for key, value in shared.items() if key not in ADDED or value is not None}
     return {
@@ -101,6 +135,17 @@ def comparable_settings(settings: StudySettings, fixed: Mapping[str, Any]) -> di
         OBJECTIVES: dict(settings.objectives),
         FIXED: shared | of_trials,
     }
+
+
+def fixed_of(study: optuna.Study, wanted: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the fixed configuration of a stored study, and the wanted one, without what only one of them compares."""
+    there, wanted = migrate(study.user_attrs.get(FIXED, {})), dict(wanted[FIXED])
+    trials = study.get_trials(deepcopy=False)
+    if POPULATION not in there and trials and not any(MEMBER in trial.user_attrs for trial in trials):
+        there[POPULATION] = None
+    alone = {key for key in there.keys() ^ wanted.keys() if key.startswith(LATER)}
+    before, now = ({key: each[key] for key in each if key not in alone} for each in (there, wanted))
+    return before, now
 
 
 def is_ours(study: optuna.Study) -> bool:
@@ -130,7 +175,7 @@ def _check_same(settings: StudySettings, study: optuna.Study, wanted: Mapping[st
     # The values of its trials are in this order.
     if [*there[OBJECTIVES]] != [*wanted[OBJECTIVES]]:
         raise StudyError(f"{whose} has its objectives in another order: {', '.join(there[OBJECTIVES])}{other}")
-    differences = _differences(migrate(there.get(FIXED, {})), wanted[FIXED])
+    differences = _differences(*fixed_of(study, wanted))
     if differences and not settings.allow_config_changes:
         raise StudyError(
             f"{whose} has trials with another configuration: {differences}; study.allow_config_changes=true accepts "

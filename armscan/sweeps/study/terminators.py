@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from statistics import fmean, variance
 from typing import Protocol
 
@@ -60,7 +60,7 @@ class BelowSeedNoise:
 
     def reason(self, study: optuna.Study, objectives: Sequence[str], state: StudyState) -> str | None:
         """See `Terminator.reason`."""
-        trials = _completed(state)
+        trials = _completed((*state.taken, *state.finished))
         if len(trials) < self._min_trials or (noise := seed_noise(trials, objectives[0], study.direction)) is None:
             return None
         # Deferred: it loads torch.
@@ -80,6 +80,8 @@ class BelowSeedNoise:
 class Stagnation:
     """Ends a study when its last trials were no better than those before.
 
+    Trials taken from other studies are among those before.
+
     With several objectives a trial is better if it is on the Pareto front of all trials, and no earlier one is as good.
 
     Args:
@@ -97,11 +99,12 @@ class Stagnation:
 
     def reason(self, study: optuna.Study, objectives: Sequence[str], state: StudyState) -> str | None:
         """See `Terminator.reason`."""
-        trials = sorted(_completed(state), key=lambda trial: (str(trial.datetime_complete), trial.number))
-        if len(trials) <= self._n_trials:
+        own = sorted(_completed(state.finished), key=lambda trial: (str(trial.datetime_complete), trial.number))
+        trials = [*_completed(state.taken), *own]
+        n_before = len(trials) - self._n_trials
+        if len(own) < self._n_trials or not n_before:
             return None
         losses = np.array([trial.values for trial in trials]) * loss_signs(study.directions)
-        n_before = len(trials) - self._n_trials
         before = np.unique(losses[:n_before], axis=0)
         # Those that are as good as one before are not better.
         new = [loss for loss in losses[n_before:] if not (before <= loss).all(axis=1).any()]
@@ -129,6 +132,5 @@ def seed_noise(trials: Sequence[FrozenTrial], objective: str, direction: StudyDi
     return fmean(variances) ** 0.5 if variances else None
 
 
-def _completed(state: StudyState) -> list[FrozenTrial]:
-    trials = (*state.taken, *state.finished)
+def _completed(trials: Iterable[FrozenTrial]) -> list[FrozenTrial]:
     return [trial for trial in trials if trial.state == TrialState.COMPLETE and is_feasible(trial)]

@@ -14,7 +14,7 @@ from optuna.trial import FrozenTrial, create_trial
 
 from armscan.config.compose import compose_run
 from armscan.config.defaults import to_plain
-from armscan.config.legacy import migrate, renamed
+from armscan.config.legacy import renamed
 from armscan.errors import StudyError, listed
 from armscan.sweeps.scheduling.state import FINISHED
 from armscan.sweeps.space.parameter import Value, hydra_literal, optuna_value, overrides_of
@@ -23,7 +23,6 @@ from armscan.sweeps.storage.attribute_names import (
     BEGUN_WITH,
     ENQUEUED_FROM,
     ENV_STEPS,
-    FIXED,
     METRICS,
     OBJECTIVES,
     SEEDS,
@@ -34,7 +33,7 @@ from armscan.sweeps.storage.attributes import FINAL_SUFFIXES, check_trials
 from armscan.sweeps.storage.reports import REPORT
 from armscan.sweeps.storage.storage import Storage, existing_storage
 from armscan.sweeps.study.settings import StudySettings
-from armscan.sweeps.study.study import best_trials, comparable_settings, is_ours
+from armscan.sweeps.study.study import best_trials, comparable_settings, fixed_of, is_ours
 
 PRESET, SOURCE = "preset {}", "study {}"
 # Number of best settings that are tried first, of a study with another configuration.
@@ -138,9 +137,9 @@ def values_of(space: Space, overrides: Sequence[str]) -> tuple[dict[str, Value],
 def _of_study(settings: StudySettings, name: str, fixed: Mapping[str, Any], storage: Storage | None) -> InitialTrials:
     source, wanted = _source(settings, name, storage), comparable_settings(settings, fixed)
     trials = [trial for trial in source.get_trials(deepcopy=False) if trial.state in FINISHED]
-    difference = _difference(source.user_attrs, wanted)
+    difference = _difference(source, wanted)
     # Only if the configurations agree: others may have values that no space has.
-    before, now = ({}, {}) if difference else map(_plain, (migrate(source.user_attrs[FIXED]), wanted[FIXED]))
+    before, now = ({}, {}) if difference else map(_plain, fixed_of(source, wanted))
     fitting: list[tuple[FrozenTrial, dict[str, Value]]] = []
     misfits = Counter[str]()
     for trial in trials:
@@ -177,13 +176,14 @@ def _source(settings: StudySettings, name: str, storage: Storage | None) -> optu
     return source
 
 
-def _difference(there: Mapping[str, Any], wanted: Mapping[str, Any]) -> str | None:
+def _difference(source: optuna.Study, wanted: Mapping[str, Any]) -> str | None:
     """Return the first difference, except in searched keys, that makes a study's values useless; None without one."""
+    there = source.user_attrs
     # The values of a trial are in this order.
     if [*there[OBJECTIVES].items()] != [*wanted[OBJECTIVES].items()]:
         return f"its objectives are {' and '.join(there[OBJECTIVES])}"
     searched = tuple(f"{key}." for key in (*renamed(there[SPACE]), *wanted[SPACE]))
-    before, now = migrate(there[FIXED]), wanted[FIXED]
+    before, now = fixed_of(source, wanted)
     keys = [key for key in {**before, **now} if not f"{key}.".startswith(searched)]
     different = [key for key in keys if before.get(key) != now.get(key)]
     if not different:

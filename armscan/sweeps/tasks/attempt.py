@@ -25,7 +25,7 @@ from armscan.tracking import TrackedRun
 from armscan.training import Evaluation, Split
 from armscan.utils.validation import check_float
 
-TRIAL_DIGITS = 4
+TRIAL_DIGITS, N_SUM_CHARS = 4, 12
 
 
 @dataclass
@@ -220,12 +220,22 @@ def trial_folder(study_folder: Path, number: int) -> Path:
 def config_sha256(config: Mapping[str, Any]) -> str:
     """Return the SHA-256 of a configuration's values except the seed, by which the runs of one trial differ."""
     values = {key: value for key, value in config.items() if key != "seed"}
+    return _sha256(values)
+
+
+def _sha256(values: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(values, sort_keys=True, default=str).encode()).hexdigest()
 
 
 def volumes_of(config: DictConfig) -> Split:
     """Return the volumes of a configuration, which stay in memory until those of another one are requested."""
     return _volumes(OmegaConf.to_yaml(config.data, resolve=True))
+
+
+def volume_sums(split: Split) -> dict[str, str]:
+    """Return how many volumes each part has, with a checksum of their names and contents, to compare them later."""
+    prints = split.fingerprints()
+    return {part: f"{len(each)} with the checksum {_sha256(each)[:N_SUM_CHARS]}" for part, each in prints.items()}
 
 
 @lru_cache(maxsize=1)

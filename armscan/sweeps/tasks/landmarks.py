@@ -65,10 +65,12 @@ class LandmarksTask:
         return {f"{TEST_PREFIX}{name}": value for name, value in metrics.items()}
 
     def _run_task(self, config: DictConfig, volumes: Mapping[str, LabelVolume]) -> dict[str, float]:
-        reward, tissues = instantiate(config.reward, _convert_="object"), self._tissues(config)
+        """Return the metrics on these volumes, by the reward as trainings have it: fitted to the training volumes."""
+        tissues = self._tissues(config)
+        reward = instantiate(config.reward, _convert_="object").fit(volumes_of(config).training.values(), tissues)
         at_plane, elsewhere = [], []
         for volume in volumes.values():
-            judge, labelled = PlaneScorer(volume, reward.fit([volume], tissues), tissues), volume.optimal_action
+            judge, labelled = PlaneScorer(volume, reward, tissues), volume.optimal_action
             if labelled is None:
                 raise InvalidValueError(f"{volume.name}: has no labelled plane, which clusterings are judged by")
             at_plane.append(judge.seen(labelled)[0])

@@ -39,7 +39,9 @@ class Reporter:
         """Report the validation of an epoch, unless the trial has inherited the epoch from its parent."""
         self.reports.append(report)
         before = inherited(self.attempt, self.reports)
-        if before is not None and report.epoch <= before.epoch:
+        # The reports come one by one, so the last inherited epoch may not be among them yet.
+        is_inherited = self.attempt.parent_folder is not None if before is None else report.epoch <= before.epoch
+        if is_inherited:
             return
         grid = self.budget.eval_every_env_steps
         # Rounded down to the grid: how far vectorised environments step beyond it says nothing about a trial.

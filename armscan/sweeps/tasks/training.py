@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import optuna
@@ -14,7 +15,7 @@ from omegaconf import DictConfig
 
 from armscan.agents import Learner
 from armscan.config.defaults import to_plain
-from armscan.errors import CheckpointError, InvalidValueError
+from armscan.errors import CheckpointError, InvalidValueError, TrackingError, TrackingUnavailableError
 from armscan.experiment.build import Experiment, build_experiment, check_keys, on_plane_of, set_up
 from armscan.experiment.job import Invocation, Job
 from armscan.experiment.provenance import place_tags, start_tracking, volume_tags
@@ -25,7 +26,7 @@ from armscan.sweeps.scheduling.state import TEST_PREFIX
 from armscan.sweeps.tasks.attempt import Attempt, volumes_of
 from armscan.sweeps.tasks.generation import begin_generation
 from armscan.sweeps.tasks.reporter import TRAINING_METRICS, Reporter
-from armscan.tracking import TrackedRun, draw_learning_curve, open_store, run_of_study, take_over
+from armscan.tracking import TrackedRun, TrackingStore, draw_learning_curve, open_store, run_of_study, take_over
 from armscan.tracking.tags import PARENT_TAG, SELECTION_PREFIX, STUDY_TAG
 from armscan.training import (
     TEST,
@@ -40,6 +41,9 @@ from armscan.training import (
 from armscan.utils.files import LAST_CHECKPOINT, LEARNING_CURVE_FILE, RUN_FILE, VIDEO_FILE, atomic_write, folder_lock
 from armscan.utils.log import log
 from armscan.utils.retry import RETRY_S
+
+if TYPE_CHECKING:
+    from mlflow.entities import Run
 
 # First seed of the episodes by which candidates are compared, which are used for nothing else.
 SELECTION_SEED = 7 * 10**6
@@ -136,7 +140,7 @@ def _train(attempt: Attempt, seed: int, conclude: Conclude | None = None) -> dic
     reporter = Reporter(attempt, seed, setup.budget)
     pruned, concluded = None, {}
     with folder_lock(folder):
-        setup, tracked, earlier = _start_or_resume(attempt, seed, setup, config, choices, folder)
+        setup, tracked, earlier = _start_or_resume(attempt, setup, config, choices, folder)
         attempt.opened(tracked)
         with tracked:
             try:
@@ -165,42 +169,61 @@ def _train(attempt: Attempt, seed: int, conclude: Conclude | None = None) -> dic
 
 
 def _start_or_resume(
-    attempt: Attempt, seed: int, setup: Experiment, config: DictConfig, choices: dict[str, str], folder: Path
+    attempt: Attempt, setup: Experiment, config: DictConfig, choices: dict[str, str], folder: Path
 ) -> tuple[Experiment, TrackedRun, list[EpochReport]]:
     """Open the tracked run of a training, and restore the agent as an earlier attempt left it."""
-    _take_over(attempt, folder)
-    begun, agent = folder / RUN_FILE, setup.agent
+    agent, before = setup.agent, attempt.folder_before
     assert isinstance(agent, Learner)
-    if begun.exists() and (folder / LAST_CHECKPOINT).exists():
-        run_id = json.loads(begun.read_text())["run_id"]
+    found = _begun_in(folder, attempt, config)
+    if found is None and before is not None and (found := _begun_in(before / folder.name, attempt, config)):
+        _take_over(found[1].info.run_id, before / folder.name, folder)
+    if found is not None and (folder / LAST_CHECKPOINT).exists():
+        client, run = found
         try:
-            earlier = resume_from_checkpoint(agent, folder, setup.provenance(run_id))
+            earlier = resume_from_checkpoint(agent, folder, setup.provenance(run.info.run_id))
         except CheckpointError:
             # The trial can always start again, with an untrained agent.
             setup = set_up(config)
         else:
-            client, experiment_id = open_store(**to_plain(config.tracking), retry_s=RETRY_S)
-            # An earlier attempt had another trial number.
-            known = {STUDY_TAG: attempt.tags[STUDY_TAG], "seed": str(seed)}
-            run = run_of_study(client, run_id, experiment_id=experiment_id, tags=known, where=str(begun))
             tags = {**volume_tags(setup.fingerprints), **place_tags(folder), **attempt.tags}
             tags[PARENT_TAG] = attempt.run_id
             return setup, TrackedRun.reopen(client, run, folder=folder, config=to_plain(config), tags=tags), earlier
     job = Job(attempt.trial.number, " ".join(attempt.overrides), "", attempt.run_id, attempt.study_folder)
     invocation = Invocation(folder, attempt.overrides, attempt.command, choices, job)
     tracked = start_tracking(config, invocation, setup, tags=attempt.tags, retry_s=RETRY_S)
-    atomic_write(begun, lambda file: file.write(json.dumps({"run_id": tracked.run_id}).encode()))
+    begun = json.dumps({"run_id": tracked.run_id}).encode()
+    atomic_write(folder / RUN_FILE, lambda file: file.write(begun))
     return setup, tracked, begin_generation(attempt, setup, folder, run_id=tracked.run_id)
 
 
-def _take_over(attempt: Attempt, folder: Path) -> None:
-    """Copy the files of the earlier attempt, unless this one has begun."""
-    before = attempt.folder_before / folder.name if attempt.folder_before else None
-    if before is None or (folder / RUN_FILE).exists() or not (before / RUN_FILE).exists():
-        return
+def _begun_in(folder: Path, attempt: Attempt, config: DictConfig) -> tuple[TrackingStore, Run] | None:
+    """Return the tracked run that this study has begun in a folder, with its store; None if there is none.
+
+    A study of the same name may have left its files there: one in another storage, or one that was deleted.
+    """
+    if not (file := folder / RUN_FILE).exists():
+        return None
+    client, experiment_id = open_store(**to_plain(config.tracking), retry_s=RETRY_S)
+    known = partial(run_of_study, client, experiment_id=experiment_id, where=str(file))
+    tags = {STUDY_TAG: attempt.tags[STUDY_TAG], "seed": str(config.seed)}
+    try:
+        run = known(json.loads(file.read_text())["run_id"], tags=tags)
+        # An earlier attempt had another trial number and another run of the trial, but below the same run of the study.
+        study_run_id = client.get_run(attempt.run_id).data.tags[PARENT_TAG]
+        known(run.data.tags.get(PARENT_TAG, ""), tags={PARENT_TAG: study_run_id})
+    except TrackingUnavailableError:
+        raise
+    except TrackingError as error:
+        log(f"trial {attempt.trial.number} does not resume from {folder}: {error}")
+        return None
+    return client, run
+
+
+def _take_over(run_id: str, before: Path, folder: Path) -> None:
+    """Copy the files of the earlier attempt."""
     for file in before.iterdir():
         if file.is_file() and not file.name.startswith(".") and file.name != RUN_FILE:
             shutil.copyfile(file, folder / file.name)
-    take_over(json.loads((before / RUN_FILE).read_text())["run_id"], before, folder)
+    take_over(run_id, before, folder)
     # Last: from then on this folder takes precedence.
     shutil.copyfile(before / RUN_FILE, folder / RUN_FILE)

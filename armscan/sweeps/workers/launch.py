@@ -160,7 +160,9 @@ def _leaving(opened: OpenedStudy, folder: Path, tracked: TrackedRun, leave_s: fl
                 for trial in phase.scheduler.reclaim(LivenessCheck().is_dead):
                     phase.close_runs_of(trial)
             judgement = judge(opened.final_eval) if opened.final_eval is not None else None
-            tracked.log_metrics(best_metrics(opened.search.scheduler.study, judgement), n_env_steps=0)
+            has_changed = judgement is not None and bool(judgement.others)
+            metrics = best_metrics(opened.search.scheduler.study, judgement)
+            tracked.log_metrics(metrics, n_env_steps=0, keeps_nan=has_changed)
             if note := result_note(judgement):
                 tracked.set_note(note)
                 where = opened.search.client, opened.search.experiment_id, opened.search.run_id, opened.folder

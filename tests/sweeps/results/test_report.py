@@ -1,7 +1,6 @@
 """The report of a study: one page without a server, every number as CSV beside it."""
 
 import base64
-import csv
 import json
 import re
 from functools import partial
@@ -13,6 +12,7 @@ from PIL import Image
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
 from armscan.sweeps.scheduling.state import Limits
 from armscan.sweeps.storage.storage import open_storage
+from tests.reports.conftest import rows
 from tests.sweeps.conftest import fail
 from tests.sweeps.study.test_final_eval import QUIET
 from tests.sweeps.study.test_final_eval import run as run_final
@@ -59,14 +59,13 @@ def judge(storage, folder):
         study.tell(trial, 1.5 + seed)
 
 
-def rows(file):
-    with file.open() as opened:
-        return list(csv.DictReader(opened))
+def page_of(answer, folder):
+    assert answer("--study=a")[0] == 0
+    return (folder / "reports" / "a" / "report.html").read_text()
 
 
 def test_report_is_one_page_with_every_number_beside_it(answer, tmp_path):
-    storage = searched(tmp_path, ["mean_steps"])
-    judge(storage, tmp_path)
+    judge(searched(tmp_path, ["mean_steps"]), tmp_path)
     assert answer("--study=a") == (0, "look at   reports/a/report.html\n", "")
     folder = tmp_path / "reports" / "a"
     page = (folder / "report.html").read_text()
@@ -121,10 +120,8 @@ def chart_below(page, heading):
 
 
 def test_history_has_the_best_so_far_and_every_number_is_rounded(answer, tmp_path):
-    storage = searched(tmp_path, ["mean_steps"])
-    judge(storage, tmp_path)
-    assert answer("--study=a")[0] == 0
-    page = (tmp_path / "reports" / "a" / "report.html").read_text()
+    judge(searched(tmp_path, ["mean_steps"]), tmp_path)
+    page = page_of(answer, tmp_path)
     points, best = chart_below(page, "History")
     assert best["name"] == "best so far"
     assert best["y"] == [min(points["y"][: end + 1]) for end in range(len(points["y"]))]
@@ -137,10 +134,8 @@ def test_history_has_the_best_so_far_and_every_number_is_rounded(answer, tmp_pat
 
 
 def test_videos_are_after_the_charts_and_pruned_trials_look_so(answer, tmp_path):
-    storage = searched(tmp_path, ["mean_steps"])
-    judge(storage, tmp_path)
-    assert answer("--study=a")[0] == 0
-    page = (tmp_path / "reports" / "a" / "report.html").read_text()
+    judge(searched(tmp_path, ["mean_steps"]), tmp_path)
+    page = page_of(answer, tmp_path)
     assert page.index("<h2>Parallel") < page.index("<h2>Episodes on a test volume") < page.index("<h2>Trials")
     lines = {each["name"]: each["marker"]["symbol"][-1] for each in chart_below(page, "While training")}
     assert lines == {"finished": "circle", "pruned": "x", "failed": "circle"}
@@ -177,8 +172,7 @@ def test_running_trials_are_listed_with_how_far_they_are(answer, tmp_path):
     trial.suggest_float("agent.lr", 0.0, 1.0)
     trial.report(0.5, 100)
     trial.set_user_attr("lease", {"worker": "<i>me</i>", "seed": 3, "env_steps": 12345, "return": -8.123456})
-    assert answer("--study=a")[0] == 0
-    page = (tmp_path / "reports" / "a" / "report.html").read_text()
+    page = page_of(answer, tmp_path)
     row = page.partition("<h2>Running now</h2>")[2].partition("</tbody>")[0]
     for cell in ("&lt;i&gt;me&lt;/i&gt;", "12,345", "-8.123"):
         assert f"<div>{cell}</div>" in row

@@ -28,7 +28,7 @@ def figures_of(of_volumes):
 def test_verdict_is_over_seeds_and_test_volumes():
     scores = np.random.default_rng(0).gamma(2.0, 2.0, (5, 8))
     (result,) = final_results([judged(7, figures_of(list(of_seed))) for of_seed in scores])
-    assert (result.number, result.n_seeds, result.figures.n_volumes) == (7, 5, 8)
+    assert (result.number, result.figures.n_seeds, result.figures.n_volumes) == (7, 5, 8)
     assert result.figures.estimates.keys() == {"mean_steps", "success_rate"}
     mean, low, high = result.figures.estimates["mean_steps"]
     assert mean == pytest.approx(scores.mean())
@@ -42,7 +42,7 @@ def test_verdict_of_the_same_trials_is_the_same_and_lacks_those_that_have_not_fi
     trials.append(judged(2, figures_of([0.0]), TrialState.FAIL))
     first, second = final_results(trials), final_results(trials)
     assert first == second
-    assert [result.n_seeds for result in first] == [6, 6]
+    assert [result.figures.n_seeds for result in first] == [6, 6]
 
 
 def test_verdict_of_one_seed_has_no_interval():
@@ -62,7 +62,7 @@ def test_verdict_leaves_the_draws_of_others_alone(monkeypatch):
     for name in ("choice", "randint", "seed"):
         monkeypatch.setattr(np.random, name, pytest.fail)
     (result,) = final_results([judged(0, figures_of([float(seed), 3.0])) for seed in range(3)])
-    assert result.n_seeds == 3
+    assert result.figures.n_seeds == 3
 
 
 def test_verdict_on_one_volume_has_the_interval_of_student():

@@ -169,8 +169,16 @@ def test_values_fit_that_the_distribution_of_a_trial_would_accept(value):
         "c": {"low": 1e-2, "high": 10.0, "log": True},
         "d": {"choices": [1, "a", [8, 8], None, True]},
     }
+    is_number = type(value) in (int, float)
+    lies_in = {
+        "a": type(value) is int and value in range(1, 10, 2),
+        "b": is_number and 0.5 <= value <= 8.5 and value % 0.5 == 0,
+        "c": is_number and 1e-2 <= value <= 10.0,
+        "d": any(type(value) is type(each) and value == each for each in (1, "a", "[8,8]", None, True)),
+    }
     for name, each in described.items():
         chosen, misfit = Space.read({name: each}).fit({name: value})
+        assert (misfit is None) is lies_in[name]
         if misfit is None:
             assert Space.read({name: each}).suggest(FixedTrial({name: value})) == {name: value}
         else:

@@ -24,6 +24,7 @@ from armscan.sweeps.storage.attributes import StudyAttributes, TrialAttributes, 
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.study import make_study
 from armscan.sweeps.workers.heartbeat import LivenessCheck
+from tests.support.refusals import assert_refused
 from tests.sweeps.study.test_study import settings
 
 OF_TRIAL = [*TrialAttributes.model_fields]
@@ -161,10 +162,7 @@ def test_report_of_rows_that_optuna_has_not_written_is_one_line(armscan, tmp_pat
     study.tell(trial, 1.0)
     with sqlite3.connect(tmp_path / "a.db") as database:
         database.execute(statement)
-    code, _, errors = armscan("report", "--study", "a", "--storage", uri)
-    assert code == 2
-    assert errors.startswith("error: ")
-    assert len(errors.splitlines()) == 1
+    assert_refused(armscan("report", "--study", "a", "--storage", uri), "")
 
 
 @pytest.mark.parametrize(
@@ -205,7 +203,4 @@ def test_report_of_journal_lines_that_optuna_has_not_written_is_one_line(armscan
         del line["sum"]
         line.update({key: value for key, value in change.items() if key in line})
     journal.write_text("".join(json.dumps(line, separators=(",", ":")) + "\n" for line in lines))
-    code, _, errors = armscan("report", "--study", "a", "--storage", str(journal))
-    assert code == 2
-    assert errors.startswith("error: ")
-    assert len(errors.splitlines()) == 1
+    assert_refused(armscan("report", "--study", "a", "--storage", str(journal)), "")

@@ -2,22 +2,20 @@
 
 import multiprocessing
 import sqlite3
+from functools import partial
 
-import optuna
 import pytest
 from optuna.exceptions import StorageInternalError
 from optuna.trial import TrialState
 from sqlalchemy.exc import OperationalError
 
 from armscan.errors import StorageUnavailableError
-from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import Limits
 from armscan.sweeps.storage.database import unavailable_reason
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.study import make_study
 from armscan.utils import retry
-from tests.support.disks import small_disk
 from tests.support.waiting import HANG_S, wait_until
+from tests.sweeps.conftest import scheduler_at
 from tests.sweeps.scheduling.test_scheduler import work
 from tests.sweeps.study.test_study import settings
 
@@ -26,24 +24,13 @@ N_TRIALS = 40
 FULL = ("No space left on device", "database or disk is full")
 
 
-@pytest.fixture
-def disk(tmp_path):
-    """Yield a disk of 20 MB."""
-    with small_disk(tmp_path / "disk", "20m") as disk:
-        yield disk
-
-
 @pytest.fixture(params=["{}/a.journal", "sqlite:///{}/a.db"], ids=["journal", "sqlite"])
 def uri(request, disk):
     return request.param.format(disk.folder)
 
 
 def test_study_waits_while_its_disk_is_full_and_loses_no_trial(disk, uri, capfd):
-    def make_scheduler(**limits):
-        storage = open_storage(uri)
-        study = optuna.create_study(study_name="a", storage=storage.optuna, load_if_exists=True)
-        return TrialScheduler(study, storage, Limits(**limits))
-
+    make_scheduler = partial(scheduler_at, uri)
     scheduler, context = make_scheduler(n_trials=N_TRIALS), multiprocessing.get_context("fork")
     workers = [context.Process(target=work, args=(make_scheduler, N_TRIALS)) for _ in range(2)]
     for worker in workers:

@@ -16,9 +16,9 @@ from mlflow import MlflowClient
 from armscan.config.credentials import STORAGE_PASSWORD, database_url
 from armscan.errors import StudyError
 from armscan.sweeps.storage.storage import open_storage
+from tests.support import FEW_VOLUMES, REPOSITORY
 from tests.support.postgres import PASSWORD
 
-REPOSITORY = Path(__file__).parents[3]
 # Trials that only wait.
 WORDS = [
     *(
@@ -28,7 +28,7 @@ WORDS = [
         "study/pruner=none",
         "study.workers=1",
     ),
-    *("study.n_trials=2", "study.final_eval.top_k=0", "data.n_training=1", "data.n_validation=1", "data.n_test=1"),
+    *("study.n_trials=2", "study.final_eval.top_k=0", *FEW_VOLUMES),
     "+study.space={training.env_steps:{low:100,high:200},agent.lr:{low:1.0e-4,high:1.0e-2}}",
 ]
 

@@ -11,7 +11,7 @@ from optuna.trial import TrialState
 
 from armscan.errors import StudyError
 from armscan.stats.bootstrap import Estimate
-from armscan.sweeps.results.judgement import Difference, Judgement, best_metrics, judge, result_note
+from armscan.sweeps.results.judgement import COMPARISONS, Difference, Judgement, best_metrics, judge, result_note
 from armscan.sweeps.results.progress import final_line
 from armscan.sweeps.results.selection import candidates_of
 from armscan.sweeps.scheduling.population import searched_values
@@ -257,6 +257,23 @@ def test_study_that_goes_on_says_for_whom_else_the_test_volumes_were_opened(stor
     assert "opened before for trial 1" in judge(final).notes[0]
 
 
+def test_run_of_a_study_that_goes_on_until_the_control_wins_keeps_no_difference(storage_uri):
+    first = run(storage_uri)
+    before = best_metrics(first.search, judge(first))
+    _, asked, search = searched(storage_uri)
+    for number in range(asked.final_eval.top_k):
+        trial = search.ask()
+        trial.suggest_float("agent.lr", 1e-4, 1e-2)
+        search.tell(trial, 0.5 + 0.01 * number)
+    worse = dict.fromkeys(range(3, 3 + asked.final_eval.top_k), 9.0)
+    judged = judge(run(storage_uri, true=TRUE | worse))
+    assert (judged.chosen, judged.others) == (CONTROL, (1,))
+    after = best_metrics(search, judged)
+    compared = [name for name in before if name.startswith(COMPARISONS)]
+    assert "difference/mean_steps_low" in compared
+    assert all(math.isnan(after[name]) for name in compared)
+
+
 def test_run_of_the_study_has_the_result(storage_uri):
     final = run(storage_uri)
     metrics = best_metrics(final.search, judge(final))
@@ -271,7 +288,7 @@ def test_note_on_a_study_says_which_settings_how_sure_and_what_helps(storage_uri
     said, chosen, control, *rest = result_note(judge(final)).split("\n\n")
     assert said == "**Trial 1 is better than the control (steps, mean).**"
     assert chosen.startswith("trial 1: `agent.lr=0.0")
-    assert control.startswith("control: the configuration of the study without")
+    assert control.startswith("control: the study's configuration without")
     assert "| with 95 % intervals | trial 1 | control |" in rest[1]
     assert rest[2] == "Trial 1 and the control, both with the same 3 new seeds:"
     difference = judge(final).differences[0].row()

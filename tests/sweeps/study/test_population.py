@@ -55,7 +55,24 @@ def test_any_sweep_of_what_can_change_trains_a_population_in_one_line():
         (["study.sampler.interval_env_steps=30000"], "study.sampler.interval_env_steps is 30000, but it must divide"),
         (
             ["study.sampler.interval_env_steps=2000"],
-            "study.sampler.interval_env_steps is 2000, but it must be at least 3000, so that each generation",
+            "study.sampler.interval_env_steps is 2000, but an epoch must begin in each generation, and they begin at "
+            "the environment steps 2000, 5008, 8016, 11024 and 6 more (training.eval_every_env_steps in whole "
+            "collections, agent.learning_starts): give study.sampler.interval_env_steps=3000",
+        ),
+        (
+            # Epochs of two collections, 4096 steps: none would begin in the generation from 7500.
+            [
+                "agent=ppo",
+                "training.env_steps=20000",
+                "training.eval_every_env_steps=2500",
+                "study.sampler.interval_env_steps=2500",
+            ],
+            "study.sampler.interval_env_steps is 2500, but an epoch must begin in each generation",
+        ),
+        (
+            # The steps before learning starts fill the first generation.
+            ["agent.learning_starts=6000", "training.eval_every_env_steps=100"],
+            "study.sampler.interval_env_steps is 6000, but an epoch must begin in each generation",
         ),
         (
             ["+study.space={stack:{choices:[1,2]}}"],

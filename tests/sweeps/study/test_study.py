@@ -1,5 +1,7 @@
 """A study in its storage: the same one is resumed, another is refused with what differs."""
 
+import re
+
 import optuna
 import pytest
 
@@ -10,7 +12,7 @@ from armscan.sweeps.study.arguments import StudyCommand, trial_overrides
 from armscan.sweeps.study.components import read_settings
 from armscan.sweeps.study.final_eval import FinalEvaluation
 from armscan.sweeps.study.settings import FinalEvalSettings, StudySettings
-from armscan.sweeps.study.study import existing_study, make_study
+from armscan.sweeps.study.study import LATER, existing_study, make_study
 
 FIXED = {"agent": {"lr": 1e-3, "gamma": 0.9}, "seed": 3, "device": "cpu", "tracking": {"uri": "a"}}
 
@@ -76,6 +78,66 @@ def test_study_that_has_changed_is_refused_with_what_differs(storage_uri, change
     with pytest.raises(StudyError) as error:
         make_study(open_storage(storage_uri), settings(**changes), FIXED | fixed)
     assert line in str(error.value)
+
+
+AGENTS = Space.read({"agent": {"choices": ["sac", "ppo"]}})
+PBT = {"sampler": {"_target_": "armscan.sweeps.scheduling.population.PopulationSampler", "population": 4}}
+PBT["sampler"]["interval_env_steps"] = 100
+
+
+def given(**changes):
+    """Return the configuration with overrides, or with checksums of the volumes, as the command adds them."""
+    return FIXED | {"study": {"overrides": {}, "volumes": {}} | changes}
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "line"),
+    [
+        (
+            ({}, given(volumes={"test": "2 with the checksum a"})),
+            ({}, given(volumes={"test": "2 with the checksum b"})),
+            "study.volumes.test was 2 with the checksum a, is 2 with the checksum b",
+        ),
+        (
+            ({"space": AGENTS}, given()),
+            ({"space": AGENTS}, given(overrides={"agent.gamma": 0.5, "stack": 1, "study.n_trials": 9})),
+            "study.overrides was [], is ['agent.gamma=0.5']",
+        ),
+        (({}, FIXED), (PBT, FIXED), "study.population was None, is [4, 100]"),
+    ],
+    ids=["other volumes", "override below a searched group", "population"],
+)
+def test_study_of_what_earlier_versions_did_not_compare_is_refused_if_both_have_it(storage_uri, before, now, line):
+    storage = open_storage(storage_uri)
+    study = make_study(storage, settings(**before[0]), before[1])
+    study.tell(study.ask(), 1.0)
+    with pytest.raises(StudyError, match=re.escape(line)):
+        make_study(storage, settings(**now[0]), now[1])
+    # The volumes are unknown to workers, which keep those of the command.
+    accepted = {"allow_config_changes": True}
+    make_study(storage, settings(**now[0], **accepted), now[1])
+    make_study(storage, settings(**now[0], **accepted), {**now[1], "stack": 4, "study": {}})
+    kept = study.user_attrs["fixed_config"]
+    assert {key: kept.get(key) for key in ("stack", "study.volumes.test")} == {
+        "stack": 4,
+        "study.volumes.test": now[1].get("study", {}).get("volumes", {}).get("test"),
+    }
+
+
+@pytest.mark.parametrize("is_population", [False, True])
+def test_study_that_was_made_before_they_were_compared_goes_on(storage_uri, is_population):
+    storage, asked = open_storage(storage_uri), PBT if is_population else {}
+    study = make_study(storage, settings(**asked), FIXED)
+    before = {key: value for key, value in study.user_attrs["fixed_config"].items() if not key.startswith(LATER)}
+    study.set_user_attr("fixed_config", before)
+    study.enqueue_trial({}, user_attrs={"member": 0} if is_population else {})
+    study.tell(study.ask(), 1.0)
+    now = given(volumes={"test": "2 with the checksum a"})
+    assert len(make_study(storage, settings(**asked), now).trials) == 1
+    if not is_population:
+        # Its trials show that it is none.
+        with pytest.raises(StudyError, match=re.escape("study.population was None, is [4, 100]")):
+            make_study(storage, settings(**PBT), now)
 
 
 def test_study_with_its_objectives_in_another_order_is_refused(storage_uri):

@@ -13,8 +13,8 @@ from optuna.trial import create_trial
 from armscan.errors import InvalidValueError
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
 from armscan.sweeps.scheduling.state import Limits, StudyState
-from armscan.sweeps.scheduling.termination import Termination
-from armscan.sweeps.storage.attribute_names import SEEDS
+from armscan.sweeps.scheduling.termination import Termination, ended_because, reopen
+from armscan.sweeps.storage.attribute_names import SEEDS, TAKEN_FROM
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.components import read_settings
 from armscan.sweeps.study.terminators import BelowSeedNoise, Stagnation, seed_noise
@@ -56,6 +56,15 @@ def test_stagnation_follows_the_direction_and_says_so():
     study = study_of([(1.0,), (3.0,), (2.0,), (2.0,)], ["maximize"])
     assert reason_of(Stagnation(3), study) is None
     assert reason_of(Stagnation(2), study) == "the last 2 of 4 trials were no better than those before"
+
+
+@pytest.mark.parametrize(("n_here", "is_over"), [(0, False), (1, False), (2, True)])
+def test_trials_taken_from_another_study_are_among_those_before(n_here, is_over):
+    study = study_of([(1.0,), (2.0,), (3.0,)])
+    taken = [create_trial(values=trial.values, user_attrs={TAKEN_FROM: f"b:{trial.number}"}) for trial in study.trials]
+    study = optuna.create_study()
+    study.add_trials([*taken, *(create_trial(value=1.5) for _ in range(n_here))])
+    assert (reason_of(Stagnation(2), study) is not None) is is_over
 
 
 def noisy(n_trials, noise, seed=0):
@@ -122,11 +131,18 @@ def test_every_worker_ends_where_one_has_found_that_the_study_ends(make):
     assert second.end_reason(second.state()) == "2 are enough"
 
 
-def test_ended_study_stays_ended_unless_something_else_is_asked_for(make):
+def test_ended_study_stays_ended_until_another_number_of_trials_is_asked_for(make):
+    """Its rule stays fulfilled, so it is checked again once a further trial has finished."""
     while run_one(make()) is not None:
         pass
-    assert run_one(make(last=50)) is None
-    assert run_one(make(asked="more trials", last=50)) is not None
+    scheduler = make()
+    assert not reopen(scheduler.study, scheduler.storage, "a")
+    assert run_one(make()) is None
+    assert reopen(scheduler.study, scheduler.storage, "more trials")
+    assert ended_because(scheduler.study, "more trials") is None
+    assert "reason" not in scheduler.study.user_attrs["terminated"]
+    assert [run_one(make(asked="more trials")) is not None for _ in range(2)] == [True, False]
+    assert ended_because(scheduler.study, "more trials") == "3 are enough"
 
 
 def test_study_is_looked_at_once_for_each_number_of_finished_trials(make):

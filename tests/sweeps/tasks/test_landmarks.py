@@ -38,6 +38,14 @@ def test_landmarks_that_cannot_be_told_apart_are_worth_less():
     assert LandmarksTask().run(coarse)["separation"] < LandmarksTask().run(Trial())["separation"]
 
 
+def test_reward_is_fitted_to_the_training_volumes_alone():
+    task, trial = LandmarksTask(), Trial("reward=agreement")
+    assert task.run(trial)["labelled_reward"] == 0.0
+    # Fitted to the plane itself, it would be 0 there.
+    assert task.validate(trial)["labelled_reward"] < 0.0
+    assert task.evaluate(trial)["test/labelled_reward"] < 0.0
+
+
 def test_landmarks_need_a_clustering_whose_parts_can_be_searched():
     with pytest.raises(InvalidValueError, match=r"env\.clustering is 'pixels', but this study searches its parts"):
         LandmarksTask().check(Trial("env.clustering=pixels").config(0)[0])

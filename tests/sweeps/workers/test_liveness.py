@@ -21,18 +21,10 @@ from tests.support.waiting import HANG_S
 IN_A_NAMESPACE = ("unshare", "--pid", "--fork", "--kill-child", "--mount-proc")
 DEAD = {"pid": 2**22 + 1, "started": "1"}
 WORK = """
-import sys, optuna
-from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import Limits
-from armscan.sweeps.storage.storage import open_storage
+import functools, sys
+from tests.sweeps.conftest import scheduler_at
 from tests.sweeps.scheduling.test_scheduler import work
-
-def make_scheduler(**limits):
-    storage = open_storage(sys.argv[1])
-    study = optuna.create_study(study_name="a", storage=storage.optuna, load_if_exists=True)
-    return TrialScheduler(study, storage, Limits(**limits))
-
-work(make_scheduler, 20)
+work(functools.partial(scheduler_at, sys.argv[1]), 20)
 """
 
 

@@ -7,6 +7,7 @@ import sqlite3
 import threading
 import time
 from dataclasses import asdict
+from functools import partial
 
 import optuna
 import pytest
@@ -26,18 +27,13 @@ from armscan.sweeps.workers.heartbeat import Heartbeat, LivenessCheck
 from armscan.utils import retry
 from armscan.utils.processes import ProcessInfo
 from tests.support.waiting import HANG_S, wait_until
+from tests.sweeps.conftest import scheduler_at
+from tests.sweeps.scheduling.test_scheduler import states
 
 
 @pytest.fixture
 def open_scheduler(postgres):
-    uri = postgres.make_database()
-
-    def opened(**limits):
-        storage = open_storage(uri)
-        study = optuna.create_study(study_name="a", storage=storage.optuna, load_if_exists=True)
-        return TrialScheduler(study, storage, Limits(**{"n_trials": 5} | limits))
-
-    return opened
+    return partial(scheduler_at, postgres.make_database())
 
 
 @pytest.fixture(params=[True, False], ids=["done", "undone"])
@@ -68,10 +64,6 @@ def lose_commit(request, monkeypatch):
 def complete(trial, value):
     """Return the outcome of a trial, which its worker tells with its next claim."""
     return TrialOutcome(trial, TrialState.COMPLETE, PendingWrites(), values=[value])
-
-
-def states(scheduler):
-    return [trial.state.name for trial in scheduler.study.get_trials(deepcopy=False)]
 
 
 def test_claim_whose_answer_is_lost_takes_one_trial(open_scheduler, lose_commit):

@@ -1,11 +1,7 @@
 """A study whose PostgreSQL and MLflow servers are unavailable for a while in the middle of it."""
 
 import contextlib
-import os
-import subprocess
-import sys
 import time
-from pathlib import Path
 
 import optuna
 import pytest
@@ -13,11 +9,12 @@ from mlflow import MlflowClient
 
 from armscan.sweeps.storage.attribute_names import RETRY_OF
 from armscan.sweeps.storage.storage import open_storage
+from tests.support import FEW_VOLUMES, REPOSITORY
 from tests.support.mlflow_server import mlflow_server
 from tests.support.postgres import postgres_server
+from tests.support.processes import start_run
 from tests.support.waiting import HANG_S, wait_until
 
-REPOSITORY = Path(__file__).parents[3]
 # A real, short training of four seconds or more, with a report after each epoch.
 TRAINING = [
     *(
@@ -26,7 +23,7 @@ TRAINING = [
         "training.validation_episodes=4",
         "study/pruner=none",
     ),
-    *("data.n_training=1", "data.n_validation=1", "data.n_test=1", "agent.learning_starts=1000"),
+    *(*FEW_VOLUMES, "agent.learning_starts=1000"),
     *("study.workers=1", "study.final_eval.top_k=0", "study.prune_after_env_steps=100"),
 ]
 
@@ -47,20 +44,14 @@ def study(folder, storage_uri, tracking_uri, *words):
     """Yield a study as a user starts it; end it in any case."""
     environment = {"ARMSCAN_STORAGE": storage_uri, "MLFLOW_TRACKING_URI": tracking_uri, "PYTHONPATH": str(REPOSITORY)}
     folder.mkdir()
-    with (folder / "printed").open("wb") as printed:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "armscan.run", "-m", "sweep=sac_y", "+cluster=postgres", *TRAINING, *words],
-            cwd=folder,
-            env=os.environ | environment,
-            stdout=printed,
-            stderr=printed,
-        )
-        try:
-            yield process
-        finally:
-            if process.poll() is None:
-                process.terminate()
-                process.wait()
+    given = ["-m", "sweep=sac_y", "+cluster=postgres", *TRAINING, *words]
+    process = start_run(*given, cwd=folder, environment=environment)
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            process.terminate()
+            process.wait()
 
 
 def worker_log(folder):

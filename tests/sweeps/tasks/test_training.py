@@ -1,0 +1,32 @@
+"""Trainings of trials: which of those that a folder holds are gone on with."""
+
+import json
+from types import SimpleNamespace
+
+import pytest
+from omegaconf import OmegaConf
+
+from armscan.sweeps.tasks.training import _begun_in
+from armscan.tracking import open_store
+
+
+@pytest.mark.parametrize(
+    ("study_run", "trial_run", "is_ours"),
+    [("this", "this", True), ("this", "an earlier attempt's", True), ("another", "another", False)],
+    ids=["requeued", "retried", "of a deleted study of this name"],
+)
+def test_training_is_gone_on_with_if_this_study_has_begun_it(tmp_path, database, study_run, trial_run, is_ours):
+    tracking = {"uri": database, "experiment": "a", "artifacts": str(tmp_path / "artifacts"), "wait_s": 60.0}
+    client, experiment_id = open_store(**tracking)
+
+    def made(name, **tags):
+        return client.create_run(experiment_id, name=name, tags=tags).info.run_id
+
+    studies = {name: made(name, study="a") for name in ("this", "another")}
+    this = made("trial", **{"study": "a", "mlflow.parentRunId": studies["this"]})
+    of_trial = this if trial_run == "this" else made(trial_run, **{"mlflow.parentRunId": studies[study_run]})
+    training = made("training", **{"study": "a", "seed": "0", "mlflow.parentRunId": of_trial})
+    (tmp_path / "run.json").write_text(json.dumps({"run_id": training}))
+    attempt = SimpleNamespace(run_id=this, tags={"study": "a"}, trial=SimpleNamespace(number=0))
+    found = _begun_in(tmp_path, attempt, OmegaConf.create({"tracking": tracking, "seed": 0}))
+    assert (found is not None and found[1].info.run_id == training) is is_ours
