@@ -142,7 +142,7 @@ def python(wheel):
     return virtual_environment(wheel.parent / "venv", wheel)
 
 
-@pytest.mark.full
+@pytest.mark.slow
 def test_wheel_composes_and_plans_in_an_empty_folder(python, tmp_path):
     # What names a cluster needs its services.
     words = json.dumps([words_of(path) for path in ALL if path.parent != Path("cluster")])

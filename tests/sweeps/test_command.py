@@ -146,7 +146,7 @@ def unwrapped(printed):
     return " ".join(printed.split())
 
 
-@pytest.mark.full
+@pytest.mark.slow
 def test_study_ends_by_itself_where_the_noise_between_seeds_is_larger_than_what_may_be_gained(tmp_path):
     words = [*TINY, "study/terminator=noise", "study.terminator.min_trials=4", "study.seeds=[0,1]", "study.workers=1"]
     words += ["study.objectives=[maximize mean_return]", "study.n_trials=30", "study.final_eval.top_k=0"]
