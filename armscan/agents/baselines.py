@@ -139,7 +139,7 @@ class ExhaustiveAgent:
         """
         # Half a component's range, counted in steps. The normalised middle is 0 for rotations and translations alike.
         halves = [self._half_range_steps(name, bounds) for name in self._swept]
-        # A step that ends at the range's end is within it, whatever the rounding of the quotient.
+        # Rounding must not exclude a step that ends exactly at the end of the range.
         n_each_side = [math.floor(half + 1e-9) for half in halves]
         if (n_planes := math.prod(2 * n + 1 for n in n_each_side)) > MAX_PLANES:
             raise InvalidValueError(

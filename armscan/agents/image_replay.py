@@ -30,8 +30,8 @@ class ImageReplay(Replay):
 
     An image of three axes or more is a sequence of frames along its first axis, such as a stack; one of two axes is a
     single frame. Most frames also occur in the previous stack, or in the next observation of the last step. They are
-    recognised by their pixels, whatever the environment's stacking, and stored once. A frame is dropped when the last
-    transition that shows it is overwritten.
+    recognised by their pixels, with any kind of stack, and stored once. A frame is dropped when the last transition
+    that shows it is overwritten.
 
     Consecutive requests for the same transitions share the memory of their images.
 

@@ -40,7 +40,7 @@ class Tissue(Protocol):
 
 @dataclass(frozen=True)
 class PixelTissue:
-    """A tissue clustered by DBSCAN on pixel coordinates, whatever the size of a pixel.
+    """A tissue clustered by DBSCAN on pixel coordinates; the size of a pixel does not matter.
 
     Args:
         label: Label of the tissue in a labelmap.

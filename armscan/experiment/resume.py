@@ -7,9 +7,9 @@ continues.
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import yaml
 from omegaconf import OmegaConf
@@ -42,19 +42,12 @@ if TYPE_CHECKING:
     from mlflow.entities import Run
 
 
-class RepeatGrid(Protocol):
-    """Function that runs the unfinished jobs of the grid that its words describe; see `armscan.run.repeat_grid`."""
-
-    def __call__(self, words: Sequence[str], run_id: str, *, trust: bool) -> None:
-        """Run them."""
-
-
-def resume(words: Sequence[str], repeat_grid: RepeatGrid) -> None:
+def resume(words: Sequence[str], repeat_grid: Callable[..., None]) -> None:
     """Resume the run that a command line names.
 
     Args:
         words: Overrides on the command line.
-        repeat_grid: Function that runs the unfinished jobs of a grid.
+        repeat_grid: Function that runs the unfinished jobs of a grid; see `armscan.run.repeat_grid`.
 
     Raises:
         InvalidValueError: If the words say anything else.

@@ -1,4 +1,4 @@
-"""What armscan must know about Hydra's launchers."""
+"""Hydra's launchers: what each requires on this machine, and which of its messages are shown."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an agent is made from, for benchmarks that build it without a configuration."""
+"""The `AgentSetup` of benchmarks that build an agent without a configuration."""
 
 from __future__ import annotations
 

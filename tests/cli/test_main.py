@@ -50,7 +50,8 @@ def test_examples_are_good_words(words, tmp_path, monkeypatch):
     for folder in ("outputs", "studies/sac_y"):
         (tmp_path / folder).mkdir(parents=True)
     path = next(path for path in COMMANDS if list(path) == words[: len(path)])
-    COMMANDS[path].make_context(" ".join(path), words[len(path) :])
+    context = COMMANDS[path].make_context(" ".join(path), words[len(path) :])
+    assert context.args == []
 
 
 @pytest.mark.parametrize("path", COMMANDS, ids=" ".join)

@@ -44,7 +44,7 @@ BESIDE = {
 
 @pytest.mark.parametrize("override", WHOLE)
 def test_conf_composes_every_agent_and_experiment(override):
-    # Few phantoms, whatever an experiment says, so that this is quick. The threshold is loose, because a reward that is
+    # Few phantoms are quick, even if an experiment asks for more. The threshold is loose, because a reward that is
     # fitted to one wrist alone would not accept the labelled plane of another.
     few = [*FEW_VOLUMES, "env.success_threshold=0.5"]
     experiment = build_experiment(compose([override, *BESIDE.get(override, []), *few]))

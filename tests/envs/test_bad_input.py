@@ -31,7 +31,7 @@ from armscan.envs import (
 from armscan.envs.actions import free_components
 from armscan.errors import ArmscanError, InvalidValueError, OptimalPlaneError
 from armscan.volumes import LabelVolume, RigidTransform
-from tests.support.junk import SETTINGS, is_answered, junk, refuses
+from tests.support.junk import SETTINGS, is_answered, junk, result_of
 
 RULES = [
     "volumes",
@@ -67,7 +67,7 @@ def works(env):
 @SETTINGS
 @given(value=junk)
 def test_env_with_junk(wrist, rule, value):
-    assert works(refuses(lambda: ArmscanEnv(**{"volumes": [wrist]} | {rule: value})))
+    assert works(result_of(lambda: ArmscanEnv(**{"volumes": [wrist]} | {rule: value})))
 
 
 @pytest.mark.parametrize("rule", WRAPPER_RULES)
@@ -77,10 +77,10 @@ def test_env_with_junk(wrist, rule, value):
 def test_made_env_with_junk(wrist, others, rule, value):
     arguments = others | {rule: value}
     env_factory = EnvFactory(**arguments)
-    assert works(refuses(lambda: make_armscan_env([wrist], **arguments)))
-    assert works(refuses(lambda: env_factory.make_env([wrist])))
-    assert works(refuses(lambda: make_armscan_vector_env(2, [wrist], **arguments)))
-    assert works(refuses(lambda: env_factory.make_vector_env(2, [wrist])))
+    assert works(result_of(lambda: make_armscan_env([wrist], **arguments)))
+    assert works(result_of(lambda: env_factory.make_env([wrist])))
+    assert works(result_of(lambda: make_armscan_vector_env(2, [wrist], **arguments)))
+    assert works(result_of(lambda: env_factory.make_vector_env(2, [wrist])))
 
 
 @pytest.mark.parametrize(
@@ -89,22 +89,22 @@ def test_made_env_with_junk(wrist, others, rule, value):
 @SETTINGS
 @given(value=junk)
 def test_vector_env_with_junk(wrist, argument, value):
-    assert works(refuses(lambda: ArmscanVectorEnv(**{"num_envs": 2, "volumes": [wrist]} | {argument: value})))
+    assert works(result_of(lambda: ArmscanVectorEnv(**{"num_envs": 2, "volumes": [wrist]} | {argument: value})))
 
 
 @SETTINGS
 @given(rules=st.dictionaries(st.sampled_from(RULES + WRAPPER_RULES), junk, min_size=2, max_size=3))
 def test_env_with_several_kinds_of_junk(wrist, rules):
-    assert works(refuses(lambda: make_armscan_env(**{"volumes": [wrist]} | rules)))
+    assert works(result_of(lambda: make_armscan_env(**{"volumes": [wrist]} | rules)))
 
 
 @pytest.mark.parametrize("argument", [field.name for field in fields(RandomTransform)])
 @SETTINGS
 @given(value=junk)
 def test_random_transform_with_junk(wrist, argument, value):
-    transform = refuses(lambda: RandomTransform(**{argument: value}))
+    transform = result_of(lambda: RandomTransform(**{argument: value}))
     if transform is not None:
-        assert works(refuses(lambda: ArmscanEnv([wrist], transform=transform)))
+        assert works(result_of(lambda: ArmscanEnv([wrist], transform=transform)))
 
 
 @SETTINGS
@@ -122,18 +122,18 @@ def test_action_bounds_and_planes_with_junk(rotation, translation):
 @given(value=junk)
 def test_observations_with_junk(wrist, value):
     made = [
-        refuses(lambda: ClusterObservation(normalised=value)),
-        refuses(lambda: ClusterObservation(targets=value)),
-        refuses(lambda: MergedObservation(value)),
-        refuses(lambda: MergedObservation([value])),
+        result_of(lambda: ClusterObservation(normalised=value)),
+        result_of(lambda: ClusterObservation(targets=value)),
+        result_of(lambda: MergedObservation(value)),
+        result_of(lambda: MergedObservation([value])),
     ]
     for kind in (SliceObservation, SliceChannelsObservation):
-        made += [refuses(lambda kind=kind: kind(crop=value)), refuses(lambda kind=kind: kind(shape=value))]
+        made += [result_of(lambda kind=kind: kind(crop=value)), result_of(lambda kind=kind: kind(shape=value))]
     for argument in ("field_of_view_mm", "pixel_mm"):
-        made.append(refuses(lambda argument=argument: MetricSliceObservation(**{argument: value})))
+        made.append(result_of(lambda argument=argument: MetricSliceObservation(**{argument: value})))
     for observation in made:
         if observation is not None:
-            assert works(refuses(lambda observation=observation: ArmscanEnv([wrist], observation=observation)))
+            assert works(result_of(lambda observation=observation: ArmscanEnv([wrist], observation=observation)))
     assert is_answered(lambda: MultiBoxSpace(value))
     assert is_answered(lambda: MultiBoxSpace({"a": value}))
 
@@ -148,10 +148,10 @@ def test_wrappers_with_junk(wrist, value):
         (VectorFrameStack, many),
         (VectorBestActionMemory, many),
     ):
-        assert works(refuses(lambda wrapper=wrapper, env=env: wrapper(env, value)))
-        assert refuses(lambda wrapper=wrapper: wrapper(value, 2)) is None
+        assert works(result_of(lambda wrapper=wrapper, env=env: wrapper(env, value)))
+        assert result_of(lambda wrapper=wrapper: wrapper(value, 2)) is None
     for wrapper, env in ((FrameStack, one), (VectorFrameStack, many)):
-        assert works(refuses(lambda wrapper=wrapper, env=env: wrapper(env, 2, exclude=value)))
+        assert works(result_of(lambda wrapper=wrapper, env=env: wrapper(env, 2, exclude=value)))
 
 
 @SETTINGS
@@ -178,7 +178,7 @@ def test_reset_seeds_of_junk(wrist, value):
 def test_actions_of_junk(wrist, value):
     for env, batch in ((ArmscanEnv([wrist], projection="zy"), value), (ArmscanVectorEnv(1, [wrist]), [value])):
         env.reset(seed=0)
-        step = refuses(lambda env=env, batch=batch: env.step(batch))
+        step = result_of(lambda env=env, batch=batch: env.step(batch))
         if step is not None:
             assert np.isfinite(step[1]).all()
             assert (np.abs(step[4]["action"]) <= 1.0).all()
@@ -267,7 +267,7 @@ def test_volumes_that_were_pickled_play_beside_others(wrist):
 @given(value=junk)
 def test_slices_with_junk(tiny_volume, value):
     plane = ManipulatorAction((0.0, 0.0), (0.0, 0.0))
-    assert refuses(lambda: tiny_volume.slice(value)) is None
+    assert result_of(lambda: tiny_volume.slice(value)) is None
     assert is_answered(lambda: tiny_volume.slice(plane, value))
     assert is_answered(lambda: tiny_volume.slice(plane, transform=value))
 
@@ -276,7 +276,7 @@ def test_slices_with_junk(tiny_volume, value):
 @given(st.tuples(*[st.floats(allow_nan=False, allow_infinity=False)] * 11))
 def test_slices_of_far_away_planes(tiny_volume, numbers):
     plane = ManipulatorAction(numbers[:2], numbers[2:4])
-    transform = refuses(lambda: RigidTransform(numbers[4:6], numbers[6:8], numbers[8:]))
+    transform = result_of(lambda: RigidTransform(numbers[4:6], numbers[6:8], numbers[8:]))
     for slice_xz in (tiny_volume.slice(plane), tiny_volume.slice(plane, transform=transform)):
         assert slice_xz.shape == tiny_volume.slice_shape
         assert slice_xz.max() <= tiny_volume.labels.max()

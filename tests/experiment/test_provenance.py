@@ -1,4 +1,4 @@
-"""What a run keeps from its start."""
+"""The files that describe the origin of a run."""
 
 from armscan.config.compose import compose_run
 from armscan.experiment.build import set_up

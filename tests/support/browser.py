@@ -76,7 +76,7 @@ def chromium(profile: Path, *, width: int = 1400, height: int = 900) -> Iterator
 
 
 class Browser:
-    """A browser that waits for whatever it is asked for.
+    """A browser that waits until what it is asked for is there.
 
     Args:
         driver: Driver of Selenium.

@@ -6,9 +6,9 @@ import numpy as np
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
-from tests.volumes.test_damaged import anything, is_answered, refuses
+from tests.volumes.test_damaged import anything, is_answered, result_of
 
-__all__ = ["SETTINGS", "is_answered", "junk", "refuses"]
+__all__ = ["SETTINGS", "is_answered", "junk", "result_of"]
 
 SETTINGS = settings(
     max_examples=40,

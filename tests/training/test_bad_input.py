@@ -5,7 +5,7 @@ from hypothesis import given
 
 from armscan.training import Budget, SolvedCriterion, phantom_data
 from armscan.training import splits as data
-from tests.support.junk import SETTINGS, junk, refuses
+from tests.support.junk import SETTINGS, is_answered, junk, result_of
 
 
 @pytest.mark.parametrize(
@@ -15,7 +15,7 @@ from tests.support.junk import SETTINGS, junk, refuses
 @given(value=junk)
 def test_budget_with_junk(changed, value):
     figures = {"env_steps": 9, "eval_every_env_steps": 3, "validation_episodes": 2}
-    budget = refuses(lambda: Budget(**figures | {changed: value}))
+    budget = result_of(lambda: Budget(**figures | {changed: value}))
     assert budget is None or changed not in ("solved", "best_by") or value in (None, "success", "distance")
 
 
@@ -23,7 +23,7 @@ def test_budget_with_junk(changed, value):
 @SETTINGS
 @given(value=junk)
 def test_solved_criterion_with_junk(changed, value):
-    criterion = refuses(lambda: SolvedCriterion(**{changed: value}))
+    criterion = result_of(lambda: SolvedCriterion(**{changed: value}))
     assert criterion is None or criterion.holds([]) is False
 
 
@@ -39,4 +39,4 @@ def test_phantom_data_with_junk(changed, value, phantom, monkeypatch):
         return {f"phantom-{seeds[0]}": phantom}
 
     monkeypatch.setattr(data, "load_phantoms", load)
-    refuses(lambda: phantom_data(**{changed: value}))
+    assert is_answered(lambda: phantom_data(**{changed: value}))

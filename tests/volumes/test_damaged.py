@@ -48,7 +48,7 @@ def is_answered(action):
     return message is None or len(message.splitlines()) == 1
 
 
-def refuses(action):
+def result_of(action):
     """Return the result of an action, None if it is refused, which must be in one line."""
     result, message = outcome(action)
     assert message is None or len(message.splitlines()) == 1
@@ -106,7 +106,7 @@ def test_truncated_files_are_refused(tmp_path, whole_files, name, kept):
     path = laid_out(tmp_path, whole_files, name, contents[: int(kept * len(contents))])
     if name == "wrist.raw":
         path = laid_out(tmp_path, whole_files | {name: path.read_bytes()}, "wrist.mhd", whole_files["wrist.mhd"])
-    volume = refuses(lambda: read_volume(path))
+    volume = result_of(lambda: read_volume(path))
     # All voxels may be there if only the end of a compressed stream, or of a header, is missing.
     if volume is not None:
         np.testing.assert_array_equal(volume.labels, make_tiny_volume().labels)
@@ -121,7 +121,7 @@ def test_files_with_flipped_bits_are_read_or_refused(tmp_path, whole_files, name
     for _ in range(data.draw(st.integers(1, 3))):
         position = data.draw(st.integers(0, min(len(damaged), 700) - 1) | st.integers(0, len(damaged) - 1))
         damaged[position] ^= 1 << data.draw(st.integers(0, 7))
-    volume = refuses(lambda: read_volume(laid_out(tmp_path, whole_files, name, bytes(damaged))))
+    volume = result_of(lambda: read_volume(laid_out(tmp_path, whole_files, name, bytes(damaged))))
     assert volume is None or is_sound(volume)
 
 
@@ -129,7 +129,7 @@ def test_files_with_flipped_bits_are_read_or_refused(tmp_path, whole_files, name
 @SETTINGS
 @given(contents=st.binary(max_size=400))
 def test_files_of_anything_are_refused(tmp_path, whole_files, name, contents):
-    assert refuses(lambda: read_volume(laid_out(tmp_path, whole_files, name, contents))) is None
+    assert result_of(lambda: read_volume(laid_out(tmp_path, whole_files, name, contents))) is None
     start = whole_files[name][:100] + contents
     assert is_answered(lambda: read_volume(laid_out(tmp_path, whole_files, name, start)))
 
@@ -182,7 +182,7 @@ def test_manifests_of_any_bytes_are_read_or_refused(write_labelmap, tmp_path, na
     )
 )
 def test_read_volume_answers_any_argument(write_labelmap, changes):
-    volume = refuses(lambda: read_volume(write_labelmap("a.nrrd"), **changes))
+    volume = result_of(lambda: read_volume(write_labelmap("a.nrrd"), **changes))
     assert volume is None or is_sound(volume)
 
 
@@ -190,7 +190,7 @@ def test_read_volume_answers_any_argument(write_labelmap, changes):
 @given(anything)
 def test_readers_answer_any_path(path):
     for reader in (read_volume, open_dataset, lambda folder: record_planes(folder, {})):
-        assert refuses(lambda reader=reader: reader(path)) is None
+        assert result_of(lambda reader=reader: reader(path)) is None
 
 
 @SETTINGS
@@ -202,7 +202,7 @@ def test_readers_answer_any_path(path):
 def test_label_volume_answers_any_argument(changes):
     volume = make_tiny_volume()
     arguments = {"labels": volume.labels, "spacing": (1.0, 1.0, 1.0), "name": "wrist"}
-    made = refuses(lambda: LabelVolume(**(arguments | changes)))
+    made = result_of(lambda: LabelVolume(**(arguments | changes)))
     assert made is None or is_sound(made)
 
 

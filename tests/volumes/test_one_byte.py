@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from armscan.volumes import read_volume
 from tests.conftest import make_tiny_volume
-from tests.volumes.test_damaged import refuses, write_whole
+from tests.volumes.test_damaged import result_of, write_whole
 
 SETTINGS = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 # By key, each with a folder of its own: the file to read, and in DAMAGED the file to damage if it is another one.
@@ -41,7 +41,7 @@ def read_with(folder, name, damaged_name, damaged):
     whole = (folder / damaged_name).read_bytes()
     (folder / damaged_name).write_bytes(damaged)
     try:
-        return refuses(lambda: read_volume(folder / name))
+        return result_of(lambda: read_volume(folder / name))
     finally:
         (folder / damaged_name).write_bytes(whole)
 

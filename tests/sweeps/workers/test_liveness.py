@@ -1,4 +1,4 @@
-"""Whose process a worker judges: only one that it can see, whatever the machines are called."""
+"""A worker judges only processes that it can see, even if another machine has the same name."""
 
 import os
 import shutil
