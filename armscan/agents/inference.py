@@ -6,7 +6,8 @@ and ReLU row by row, for every batch size; other networks compute one row at a t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import torch
@@ -81,7 +82,7 @@ class Inference:
             observations: Observations, shape (n, ...).
             episodes: Episode of each observation, its index among the seeds.
         """
-        with torch.no_grad():
+        with torch.no_grad(), _in_eval_mode(self._actor):
             if self._layers is not None:
                 means = torch.from_numpy(_forward(self._layers, np.asarray(observations)))
                 chosen = [self._bounded(mean) for mean in means]
@@ -102,12 +103,29 @@ class Inference:
         return self._bounded(mean)
 
 
+@contextlib.contextmanager
+def _in_eval_mode(module: nn.Module) -> Iterator[None]:
+    """Switch off dropout and the like for a while."""
+    was_training = module.training
+    module.eval()
+    try:
+        yield
+    finally:
+        module.train(was_training)
+
+
 def _layers_of(actor: nn.Module) -> list[nn.Module] | None:
     """Return the layers that compute an actor's mean; None if they are not all linear or ReLU."""
     if type(actor) is not ContinuousActorProbabilistic or type(actor.preprocess) is not Net:
         return None
+    if not actor._unbounded or actor.preprocess.softmax:
+        return None
     layers = [*actor.preprocess.model.model, *actor.mu.model]
-    return layers if all(isinstance(layer, nn.Linear | nn.ReLU) for layer in layers) else None
+    return layers if all(map(_is_plain, layers)) else None
+
+
+def _is_plain(layer: nn.Module) -> bool:
+    return isinstance(layer, nn.ReLU) or (isinstance(layer, nn.Linear) and layer.bias is not None)
 
 
 def _forward(layers: Sequence[nn.Module], rows: Rows) -> Rows:

@@ -118,6 +118,8 @@ class PlaneFinderLearner(SupervisedLearner):
         loss = len(seen) * nn.functional.smooth_l1_loss(place / scale, wanted / scale, reduction="none").mean(0).sum()
         off = (place - wanted).detach()
         errors = torch.stack([off[:, 2].abs(), torch.rad2deg(off[:, :2].norm(dim=1))], dim=1)
+        # The network's own: what it learns must not depend on how often it was calibrated.
+        expected = expected / self._module.calibration
         # Negative log-likelihood of errors from an exponential distribution with this mean.
         expected_error_loss = (expected.log() + errors / expected).mean()
         self._set_lr(finder.lr_after(self._n_env_steps, self._total_env_steps))

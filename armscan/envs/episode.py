@@ -112,7 +112,8 @@ def begin(rules: Rules, rngs: Sequence[np.random.Generator], volume_names: Seque
         volume_names: Name of each episode's volume; None draws one.
     """
     drawn = [
-        name or rules.names[int(rng.integers(len(rules.names)))] for name, rng in zip(volume_names, rngs, strict=True)
+        rules.names[int(rng.integers(len(rules.names)))] if name is None else name
+        for name, rng in zip(volume_names, rngs, strict=True)
     ]
     scenes = rules.draw_scenes(drawn, rngs)
     return [Episode(rules, *scene, _start(rules, rng)) for scene, rng in zip(scenes, rngs, strict=True)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
@@ -17,6 +18,7 @@ from armscan.volumes.rigid_transform import NO_MAPS, RigidTransform, mapped_plan
 from armscan.volumes.volume import LabelVolume
 
 MAX_SHIFT_MM = 10_000.0
+ROUNDING_DEG = 1e-9
 CENTRES = ("middle", "first_voxel")
 # Limit of scale, stretch and shear, within which no draw comes near a flat volume.
 MAX_DEFORMATION = 0.3
@@ -172,9 +174,11 @@ class SceneSampler:
             ("rz", "rx"), volume.optimal_action.rotation, turns, self.rotation_bounds_deg, strict=True
         ):
             if bound < 180.0 and abs(angle) + turn > bound:
+                # Rounded up, so that the bound it names is accepted.
+                least = math.ceil(1e6 * (abs(angle) + turn)) / 1e6
                 raise OptimalPlaneError(
                     f"{volume.name}: the optimal plane has {name} = {angle:g} degrees and can be turned by {turn:g} "
-                    f"more, but the rotation bound is {bound:g}; it must be at least {abs(angle) + turn:g}"
+                    f"more, but the rotation bound is {bound:g}; it must be at least {least:.10g}"
                 )
         scene = self._scene(volume, None)
         if scene is None:
@@ -194,10 +198,11 @@ class SceneSampler:
         bounds = self.bounds(volume)
         optimum = volume.optimal_action if transform is None else transform.inverse_plane(volume.optimal_action)
         within = shift_into(optimum, bounds.translation_mm)
-        (rz, rx), (bound_rz, bound_rx) = optimum.rotation, self.rotation_bounds_deg
-        if within is None or abs(rz) > bound_rz or abs(rx) > bound_rx:
+        rotation = np.clip(optimum.rotation, *np.multiply.outer((-1.0, 1.0), self.rotation_bounds_deg))
+        # A plane on the bound may be beyond it by the rounding of the motion.
+        if within is None or np.abs(rotation - optimum.rotation).max() > ROUNDING_DEG:
             return None
-        return Scene(volume, transform, within, bounds)
+        return Scene(volume, transform, replace(within, rotation=(float(rotation[0]), float(rotation[1]))), bounds)
 
 
 def shows_labelled(scene: Scene) -> bool:

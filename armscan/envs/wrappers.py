@@ -12,7 +12,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
-from gymnasium.vector import VectorEnv, VectorWrapper
+from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
 from armscan.envs.history import (
@@ -107,6 +107,11 @@ class _VectorRemembering(VectorWrapper):
     """A wrapper that adds each episode's history to its observations."""
 
     def __init__(self, env: VectorEnv[Any, Any, Any], remembered: EpisodeHistory) -> None:
+        if env.metadata.get("autoreset_mode") is AutoresetMode.SAME_STEP:
+            raise InvalidValueError(
+                f"{type(self).__name__} wraps environments that reset at the next step or not by themselves, but these "
+                "reset in the same step, when the last observation is no longer the episode's"
+            )
         super().__init__(env)
         self.remembered = remembered
         self.single_observation_space = space_of(remembered.boxes)

@@ -128,8 +128,9 @@ def source_in(folder: Path) -> Source:
 def _diff(tree: Path) -> bytes:
     """Return the diff of a working tree from its commit, including new files; change nothing."""
     new = [name for name in _git(tree, "ls-files", "--others", "--exclude-standard", "-z").split(b"\0") if name]
-    kept = [name for name in new if (tree / os.fsdecode(name)).lstat().st_size <= MAX_UNTRACKED_BYTES]
-    told = "".join(f"# not kept, for its size: {os.fsdecode(name)!r}\n" for name in new if name not in kept).encode()
+    left_out = {name: why for name in new if (why := _why_left_out(tree, name))}
+    told = "".join(f"# not kept, {why}: {os.fsdecode(name)!r}\n" for name, why in left_out.items()).encode()
+    kept = [name for name in new if name not in left_out]
     with tempfile.TemporaryDirectory() as beside:
         # A diff shows new files only if the index lists them: list them in a copy of the index.
         index = Path(beside, "index")
@@ -138,6 +139,13 @@ def _diff(tree: Path) -> bytes:
             words = ("add", "--intent-to-add", "--force", "--pathspec-from-file=-", "--pathspec-file-nul")
             _git(tree, "--literal-pathspecs", *words, index=index, given=b"\0".join(kept))
         return told + _git(tree, "diff", *PLAIN, "HEAD", index=index)
+
+
+def _why_left_out(tree: Path, name: bytes) -> str | None:
+    """Return why the diff cannot include a new file; None if it can."""
+    if name.endswith(b"/"):
+        return "because it is a repository of its own"
+    return "for its size" if (tree / os.fsdecode(name)).lstat().st_size > MAX_UNTRACKED_BYTES else None
 
 
 def _git(folder: Path, *arguments: str, index: Path | None = None, given: bytes = b"") -> bytes:

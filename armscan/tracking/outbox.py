@@ -76,6 +76,9 @@ class OutboxFile:
             self.address = Address(**next(self.entries())["address"])
         except (StopIteration, TypeError, KeyError) as error:
             raise TrackingError(f"{file}: does not begin with the ID of its run") from error
+        # A stranger's folder could name a run of the user's.
+        if self.address.run_id != file.stem:
+            raise TrackingError(f"{file}: begins with the ID of another run, {self.address.run_id}")
         self._uploaded: dict[Channel, int] = dict.fromkeys(CHANNELS, 0) | self._read_uploaded()
 
     @property
@@ -113,6 +116,11 @@ class OutboxFile:
     def is_uploaded(self) -> bool:
         """Return whether everything is uploaded."""
         return all(not self.next_entries(channel, 1)[0] for channel in CHANNELS)
+
+    @property
+    def n_uploaded_bytes(self) -> int:
+        """How far the channels are uploaded, in bytes of the file, summed."""
+        return sum(self._uploaded.values())
 
     @property
     def status(self) -> str | None:

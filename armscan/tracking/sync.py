@@ -58,9 +58,11 @@ def sync(folder: Path, opened: Callable[[str], TrackingStore], *, trust: bool = 
     Returns:
         The outcome for each run that had entries left, is in use, or has a damaged outbox.
     """
-    place = folder.absolute()
+    place = folder.resolve()
     removed = [
-        each.outbox for each in notes().values() if each.outbox.is_relative_to(place) and not each.outbox.exists()
+        each.outbox
+        for each in notes().values()
+        if each.outbox.resolve().is_relative_to(place) and not each.outbox.exists()
     ]
     return _synced([*outbox_files(folder), *removed], opened, trust=trust)
 
@@ -96,7 +98,7 @@ def _synced(files: Iterable[Path], opened: Callable[[str], TrackingStore], *, tr
 def _is_abandoned(run_id: str, file: Path) -> bool:
     """Return whether the process that wrote this outbox of a run has died on this machine."""
     note = Note.of(run_id)
-    return note is not None and note.is_abandoned and note.outbox == file.absolute()
+    return note is not None and note.is_abandoned and note.outbox.resolve() == file.resolve()
 
 
 def _end_removed(run_id: str, opened: Callable[[str], TrackingStore]) -> str | None:
@@ -146,7 +148,7 @@ def _check_own(outbox: Outbox, store: TrackingStore) -> None:
     """Raise `UntrustedError` unless the run was tracked from this folder: a stranger's could name any of the user's."""
     run_id, folder = outbox.address.run_id, outbox.folder.resolve()
     note = Note.of(run_id)
-    if note is not None and note.outbox == outbox.file.absolute():
+    if note is not None and note.outbox.resolve() == outbox.file.resolve():
         return
     noted = store.mlflow.get_run(run_id).data.tags.get(FOLDER_TAG)
     if noted != str(folder):

@@ -60,13 +60,15 @@ class Uploader:
         """Wait until everything is uploaded, and end the thread.
 
         Args:
-            wait_s: Longest wait in seconds; a store that refuses entries is not waited for.
+            wait_s: Longest wait in seconds without an upload; a store that refuses entries is not waited for.
 
         Returns:
             Why not everything is uploaded; None if it is.
         """
-        until_s, is_told = time.monotonic() + wait_s, False
+        until_s, n_uploaded, is_told = time.monotonic() + wait_s, self._outbox.n_uploaded_bytes, False
         while not self._is_done.wait(min(LOOK_S, max(0.0, until_s - time.monotonic()))):
+            if n_uploaded != (n_uploaded := self._outbox.n_uploaded_bytes):
+                until_s = time.monotonic() + wait_s
             if not self.is_unavailable or time.monotonic() > until_s:
                 break
             if self._failure is not None and not is_told:
@@ -76,7 +78,7 @@ class Uploader:
         self._woken.set()
         # The thread may hang in a request, which this process does not wait for.
         self._thread.join(0.5)
-        if self._is_done.is_set():
+        if self._outbox.is_uploaded:
             return None
         return "the store has not answered in time" if self._failure is None else reason_in(self._failure)
 
@@ -218,8 +220,10 @@ def _upload(client: MlflowClient, outbox: Outbox, kind: str, values: list[Any]) 
 
 def set_description(client: MlflowClient | TrackingStore, run_id: str, text: str) -> None:
     """Set the description of a run, unless a person has written one."""
+    from mlflow.entities import RunTag
+
     text = truncate(text, MAX_TAG_CHARS, RESULTS_PAGE)
     tags = client.get_run(run_id).data.tags
     if NOTE_TAG not in tags or sha256(tags[NOTE_TAG].encode()) == tags.get(NOTE_SUM_TAG):
-        client.set_tag(run_id, NOTE_TAG, text)
-        client.set_tag(run_id, NOTE_SUM_TAG, sha256(text.encode()))
+        # In one request: a description without its checksum would look like a person's.
+        client.log_batch(run_id, tags=[RunTag(NOTE_TAG, text), RunTag(NOTE_SUM_TAG, sha256(text.encode()))])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -139,7 +140,7 @@ def _read_labels(path: Path, options: ReadingOptions) -> tuple[SimpleITK.Image, 
         if suffix == SEGMENTATION_SUFFIX:
             labels, matrix, found = read_segmentation(path, options.labels, options.overlap)
             return _image(labels, matrix, path), found
-        stored = SimpleITK.ReadImage(str(path))
+        stored = _read_image(path)
     except UnicodeEncodeError as error:
         raise VolumeError(f"{str(path)!a}: the file's name must be valid UTF-8") from error
     except OSError as error:
@@ -160,6 +161,18 @@ def _read_labels(path: Path, options: ReadingOptions) -> tuple[SimpleITK.Image, 
     image = SimpleITK.GetImageFromArray(values)
     image.CopyInformation(stored)
     return image, found
+
+
+def _read_image(path: Path) -> SimpleITK.Image:
+    import SimpleITK
+
+    if not path.name.endswith(".nii.gz"):
+        return SimpleITK.ReadImage(str(path))
+    # SimpleITK would read the voxels of a `wrist.nii` beside `wrist.nii.gz`.
+    with tempfile.TemporaryDirectory() as folder:
+        alone = Path(folder, path.name)
+        alone.symlink_to(path.absolute())
+        return SimpleITK.ReadImage(str(alone))
 
 
 def _image(labels: NDArray[np.uint8], matrix: FloatArray, path: Path) -> SimpleITK.Image:

@@ -1,9 +1,49 @@
 """Actions of many observations at once, each the same as alone."""
 
 import numpy as np
+import pytest
 import torch
+from tianshou.utils.net.common import Net
+from tianshou.utils.net.continuous import ContinuousActorProbabilistic
+from torch import nn
 
-from armscan.agents.inference import linear_rows
+from armscan.agents.compute import Compute
+from armscan.agents.inference import Inference, linear_rows
+
+
+class Dropout(Net):
+    """A network whose answers are random while it trains."""
+
+    def __init__(self):
+        super().__init__(state_shape=(3,), hidden_sizes=[16])
+        self.model.model.append(nn.Dropout())
+
+
+NETWORKS = {
+    "plain": lambda: (Net(state_shape=(3,), hidden_sizes=[16]), True),
+    "bounded by tanh": lambda: (Net(state_shape=(3,), hidden_sizes=[16]), False),
+    "softmax": lambda: (Net(state_shape=(3,), hidden_sizes=[16], action_shape=(16,), softmax=True), True),
+    "no bias": lambda: (
+        Net(state_shape=(3,), hidden_sizes=[16], linear_layer=lambda n, m: nn.Linear(n, m, bias=False)),
+        True,
+    ),
+    "dropout": lambda: (Dropout(), True),
+}
+
+
+@pytest.mark.parametrize("network", NETWORKS)
+def test_actions_are_the_mean_of_the_actor_as_it_is_evaluated(network):
+    torch.manual_seed(0)
+    preprocess, is_unbounded = NETWORKS[network]()
+    actor = ContinuousActorProbabilistic(preprocess_net=preprocess, action_shape=(2,), unbounded=is_unbounded)
+    for parameter in actor.parameters():
+        nn.init.normal_(parameter)
+    observations = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
+    actions = Inference(actor, lambda mean: mean, Compute()).actions(observations, range(5))
+    assert actor.training
+    with torch.no_grad():
+        (wanted, _), _ = actor.eval()(observations)
+    np.testing.assert_allclose(actions, wanted.numpy(), rtol=1e-5, atol=1e-5)
 
 
 def test_linear_rows_are_torchs_to_rounding():

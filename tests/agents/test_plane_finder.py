@@ -191,6 +191,18 @@ def test_expected_errors_are_right_on_average_where_they_were_calibrated(phantom
     assert min(learner.expected_error) > 0.0
 
 
+def test_calibration_changes_nothing_that_is_learned(phantom):
+    learners = [made(phantom)[0] for _ in range(2)]
+    learners[1]._module.calibration.mul_(3.0)
+    weights = []
+    for learner in learners:
+        learner._calibration_envs = None
+        learner.learn(48)
+        weights.append(dict(learner._module.network.named_parameters()))
+    for name, weight in weights[0].items():
+        torch.testing.assert_close(weight, weights[1][name], rtol=1e-3, atol=1e-6)
+
+
 @pytest.mark.parametrize("share", [None, 0.0, 0.25, 1.0])
 def test_phantoms_have_their_share_beside_other_volumes(phantom, share):
     wrist = LabelVolume(phantom.labels, phantom.spacing, "wrist", phantom.optimal_action)

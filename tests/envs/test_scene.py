@@ -210,10 +210,26 @@ def test_task_refuses_a_plane_that_does_not_score():
 
 
 def test_task_refuses_bounds_that_do_not_hold_the_turned_plane(phantom):
-    rz = phantom.optimal_action.rotation[0]
-    with pytest.raises(OptimalPlaneError, match=r"phantom-0: the optimal plane has rz = .* it must be at least"):
+    rz = 7.1234567
+    plane = ManipulatorAction((rz, 0.0), phantom.optimal_action.translation)
+    phantom = LabelVolume(phantom.labels, phantom.spacing, "phantom-0", plane)
+    expected = r"phantom-0: the optimal plane has rz = .* it must be at least (\S+)$"
+    with pytest.raises(OptimalPlaneError, match=expected) as refused:
         make_rules(phantom, rotation_bounds_deg=(abs(rz) + 9.0, 45.0))
-    make_rules(phantom, rotation_bounds_deg=(abs(rz) + 10.1, 45.0))
+    make_rules(phantom, rotation_bounds_deg=(float(str(refused.value).split()[-1]), 45.0))
+
+
+def test_plane_that_lies_on_the_rotation_bound_is_reached(phantom):
+    rotation = (7.1234567, 3.3)
+    plane = ManipulatorAction(rotation, phantom.optimal_action.translation)
+    sampler = SceneSampler(
+        rotation_bounds_deg=rotation,
+        translation_bounds_mm=None,
+        transform=RandomTransform(rz_deg=0.0, rx_deg=0.0, tx_mm=5.0, ty_mm=5.0),
+    )
+    scene = sampler.propose(LabelVolume(phantom.labels, phantom.spacing, "tilted", plane), np.random.default_rng(0))
+    assert scene is not None
+    assert np.abs(scene.optimum_normalised).max() <= 1
 
 
 def test_task_refuses_a_plane_outside_the_volume(phantom):

@@ -4,9 +4,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import data_equivalence
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import FlattenObservation, FrameStackObservation
 
 from armscan.envs import ArmscanEnv, BestActionMemory, FrameStack, SliceObservation, make_armscan_env
+from armscan.envs.wrappers import VectorBestActionMemory, VectorFrameStack
 from armscan.errors import InvalidValueError
 
 
@@ -187,6 +189,14 @@ def test_memory_is_stacked_or_not_as_the_order_says(wrist, flat):
 def test_memory_refuses_an_observation_that_has_one(wrist):
     with pytest.raises(InvalidValueError, match="already has a part 'memory'"):
         BestActionMemory(image_env(wrist, memory=1), 1)
+
+
+@pytest.mark.parametrize("wrapper", [VectorFrameStack, VectorBestActionMemory])
+def test_vector_wrappers_refuse_environments_that_reset_in_the_same_step(phantom, wrapper):
+    options = {"autoreset_mode": AutoresetMode.SAME_STEP}
+    envs = SyncVectorEnv([lambda: ArmscanEnv([phantom], observation="cluster")] * 2, **options)
+    with pytest.raises(InvalidValueError, match=rf"{wrapper.__name__} wraps environments that reset at the next step"):
+        wrapper(envs, 2)
 
 
 @pytest.mark.parametrize("wrapper", [FrameStack, BestActionMemory])

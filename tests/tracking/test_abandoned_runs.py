@@ -1,43 +1,52 @@
 """Runs whose process was killed: the next process ends them, if the process was of this machine and is gone."""
 
 import json
+import multiprocessing
+import os
 import shutil
-import subprocess
-import sys
+import signal
 from dataclasses import asdict
 
 import pytest
 from mlflow import MlflowClient
 
-from armscan.tracking import open_existing_store, sync
+from armscan.tracking import TrackedRun, open_existing_store, open_store, sync
 from armscan.tracking.notes import NOTES_FOLDER, notes
 from armscan.tracking.sync import FOLDER_REMOVED, PROCESS_DIED, _upload_pending
 from armscan.utils.processes import ProcessInfo
+from tests.support.waiting import HANG_S
 
 pytestmark = pytest.mark.full
-KILLED = """
-import os, signal, sys
-from pathlib import Path
-from armscan.tracking import TrackedRun, open_store
-store, experiment = open_store(sys.argv[1], experiment="test", artifacts=sys.argv[2], wait_s=60.0)
-tracked = TrackedRun.start(store, experiment, name="n", config={"seed": 3}, tags={}, folder=Path(sys.argv[2], "run"))
-tracked._uploader.finish(60.0)
-print(tracked.run_id, flush=True)
-os.kill(os.getpid(), signal.SIGKILL)
-"""
+# Forks have imported the package, which takes seconds.
+FORKSERVER = multiprocessing.get_context("forkserver")
+FORKSERVER.set_forkserver_preload([__name__, "mlflow.store.tracking.sqlalchemy_store"])
 
 
 @pytest.fixture
-def uri(tmp_path, monkeypatch):
+def uri(database, tmp_path, monkeypatch):
     monkeypatch.setenv("ARMSCAN_CACHE", str(tmp_path / "cache"))
-    return f"sqlite:///{tmp_path}/runs.db"
+    return database
+
+
+def start_and_die(uri, folder, cache, started):
+    """Start a run in the folder `run`, and be killed while it trains."""
+    os.environ["ARMSCAN_CACHE"] = str(cache)
+    store, experiment = open_store(uri, experiment="test", artifacts=str(folder), wait_s=60.0)
+    tracked = TrackedRun.start(store, experiment, name="n", config={"seed": 3}, tags={}, folder=folder / "run")
+    tracked._uploader.finish(60.0)
+    started.send(tracked.run_id)
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
 @pytest.fixture
 def run_id(uri, tmp_path):
     """Return the ID of a run in the folder `run` that was killed while it trained."""
-    command = [sys.executable, "-c", KILLED, uri, str(tmp_path)]
-    run_id = subprocess.run(command, capture_output=True, text=True).stdout.strip()
+    receiver, sender = FORKSERVER.Pipe(duplex=False)
+    process = FORKSERVER.Process(target=start_and_die, args=(uri, tmp_path, tmp_path / "cache", sender))
+    process.start()
+    assert receiver.poll(HANG_S)
+    run_id = receiver.recv()
+    process.join()
     assert notes().keys() == {run_id}
     assert ending_of(uri, run_id) == ("RUNNING", None)
     return run_id
@@ -74,3 +83,11 @@ def test_run_of_another_machine_or_of_a_living_process_is_not_ended(uri, run_id,
     sync(tmp_path, open_existing_store)
     _upload_pending(open_existing_store(uri))
     assert ending_of(uri, run_id) == ("RUNNING", None)
+
+
+@pytest.mark.parametrize("place", ["link", "sub/.."])
+def test_folder_may_be_named_in_any_way(uri, run_id, tmp_path, place):
+    (tmp_path / "link").symlink_to(tmp_path)
+    (tmp_path / "sub").mkdir()
+    assert not any(upload.left for upload in sync(tmp_path / place, open_existing_store))
+    assert ending_of(uri, run_id) == ("FAILED", PROCESS_DIED)

@@ -78,6 +78,18 @@ def test_source_names_new_files_that_are_too_large_and_leaves_ignored_ones_out(r
     assert source_in(repository).diff == b"# not kept, for its size: 'volume.nii'\n"
 
 
+def test_source_names_a_repository_inside_the_tree_and_keeps_the_rest(repository):
+    (repository / "theirs").mkdir()
+    (repository / "theirs" / "a.py").write_text("a = 1\n")
+    for words in (["init", "--quiet"], ["add", "a.py"], ["commit", "--quiet", "--message", "first"]):
+        git(repository / "theirs", *words)
+    (repository / "new.py").write_text("b = 2\n")
+    diff = source_in(repository).diff
+    assert diff.startswith(b"# not kept, because it is a repository of its own: 'theirs/'\n")
+    assert b"+b = 2" in diff
+    assert b"Subproject" not in diff
+
+
 def test_source_keeps_new_files_of_odd_names_and_links(repository, tmp_path):
     for name in ("-", "a b", "*", ":(top)x", "\n", "ü"):
         (repository / name).write_text("new\n")

@@ -91,8 +91,15 @@ def test_outbox_names_a_file_that_does_not_say_what_it_is_of(tmp_path, contents)
     with pytest.raises(TrackingError, match="does not begin with the ID of its run"):
         Outbox(file)
     # An outbox that could not be opened is not locked.
-    file.write_bytes(json.dumps({"address": {"run_id": "b", "uri": "c"}}).encode() + b"\n")
+    file.write_bytes(json.dumps({"address": {"run_id": "b" * 32, "uri": "c"}}).encode() + b"\n")
     Outbox(file, timeout_s=0.0).close()
+
+
+def test_outbox_that_names_another_run_than_its_file_is_not_opened(outbox, tmp_path):
+    file = file_of(tmp_path, "b" * 32)
+    outbox.file.rename(file)
+    with pytest.raises(TrackingError, match=f"{file}: begins with the ID of another run, {ADDRESS.run_id}"):
+        Outbox(file)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,10 @@ import math
 import sqlite3
 import subprocess
 import sys
+import time
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 
@@ -23,12 +26,13 @@ from armscan.tracking import (
     open_existing_store,
     open_store,
     source,
+    uploader,
 )
 from armscan.tracking.notes import NOTES_FOLDER, Note, notes
 from armscan.tracking.outbox import Address, Outbox, file_of
 from armscan.tracking.sanitize import flatten
 from armscan.tracking.sync import _upload_pending, sync
-from armscan.tracking.tags import VERSION_TAG
+from armscan.tracking.tags import NOTE_TAG, VERSION_TAG
 from armscan.tracking.uploader import upload
 from armscan.training import EpochReport, TrainingResult
 from armscan.utils.processes import ProcessInfo
@@ -111,6 +115,40 @@ def test_metric_that_is_not_valid_any_more_is_replaced_by_nan_where_that_is_aske
     metrics = client.get_run(run_id).data.metrics
     assert math.isnan(metrics["a"])
     assert metrics["b"] == 2.0
+
+
+def test_store_that_takes_long_is_waited_for_as_long_as_it_takes_entries(store, tmp_path, monkeypatch):
+    client, experiment_id = store
+    clock_s, upload_entries = [0.0], uploader._upload
+
+    def slow_upload(*arguments):
+        upload_entries(*arguments)
+        # Longer than the pause between two looks.
+        time.sleep(1.2 * uploader.LOOK_S)
+        clock_s[0] += 40.0
+
+    monkeypatch.setattr(uploader, "_upload", slow_upload)
+    monkeypatch.setattr(uploader, "time", SimpleNamespace(monotonic=lambda: clock_s[0]))
+    tracked = TrackedRun.start(client, experiment_id, name="n", config={}, tags={}, folder=tmp_path)
+    for number in range(3):
+        (tmp_path / f"{number}.pt").write_text("weights")
+        tracked.log_files(tmp_path / f"{number}.pt")
+    assert tracked.end("FINISHED", wait_s=60.0)
+    assert clock_s[0] > 2 * 60.0
+
+
+def test_description_of_a_person_stays_and_armscans_is_replaced(store):
+    client, experiment_id = store
+    run_id = client.create_run(experiment_id, name="n", tags={}).info.run_id
+    requests = Mock(wraps=client.mlflow.log_batch)
+    for text in ("first", "second"):
+        uploader.set_description(SimpleNamespace(get_run=client.get_run, log_batch=requests), run_id, text)
+        # A description without its checksum would pass for a person's.
+        assert requests.call_args.kwargs["tags"][0].value == text
+        assert client.get_run(run_id).data.tags[NOTE_TAG] == text
+    client.mlflow.set_tag(run_id, NOTE_TAG, "a person's")
+    uploader.set_description(client.mlflow, run_id, "third")
+    assert client.get_run(run_id).data.tags[NOTE_TAG] == "a person's"
 
 
 def test_tracked_run_keeps_a_folder_with_all_in_it_and_what_makes_it_a_model_last(store, tmp_path):

@@ -19,6 +19,13 @@ def test_read_volume_gives_what_was_written(write_labelmap, tiny_volume, name):
     assert volume.name == name
 
 
+def test_read_volume_gives_the_file_that_was_named_not_its_twin_beside_it(write_labelmap, tiny_volume):
+    twin = write_labelmap("wrist.nii", labels=tiny_volume.labels[::-1])
+    volume = read_volume(write_labelmap("wrist.nii.gz"))
+    np.testing.assert_array_equal(volume.labels, tiny_volume.labels)
+    np.testing.assert_array_equal(read_volume(twin).labels, tiny_volume.labels[::-1])
+
+
 @pytest.mark.parametrize("dtype", [np.int16, np.int32, np.uint16, np.float32, np.float64])
 def test_read_volume_accepts_any_type_of_whole_numbers(write_labelmap, tiny_volume, dtype):
     volume = read_volume(write_labelmap(labels=tiny_volume.labels.astype(dtype)))

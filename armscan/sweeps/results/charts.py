@@ -51,7 +51,8 @@ def charts_of(
     if not complete:
         yield "<p>No trial has run to its end yet.</p>"
         return
-    if len(objectives) > 1:
+    # Optuna draws a front of two or three objectives.
+    if len(objectives) in (2, 3):
         figure = plot_pareto_front(study, target_names=list(map(title_of, objectives)))
         yield _titled("Trials that no other is better than", figure.update_layout(height=HEIGHT_PX))
     for number, (objective, direction) in enumerate(zip(objectives, study.directions, strict=True)):

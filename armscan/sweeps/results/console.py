@@ -115,6 +115,10 @@ def _print_final_results(opened: OpenedStudy, final: FinalEvaluation) -> int:
     for name, settings in judgement.settings.items():
         print_sentence(f"{name}: {settings or NOTHING_SEARCHED}")
     print_sentence(f"result: {judgement.result}")
+    if n_left := final.n_unjudged:
+        left = f"trainings on the test volumes are missing ({n_left}); the same command resumes the study"
+        print(f"error: {left}", file=sys.stderr)
+        return os.EX_TEMPFAIL
     return 0
 
 

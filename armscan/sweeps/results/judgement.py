@@ -107,6 +107,8 @@ class Judgement:
         n_planned: Number of seeds planned for both.
         others: Other trials evaluated on the test volumes, because the study continued after its end.
         settings: Overrides of the chosen one and the control, by their names; an empty string without any.
+        n_unjudged: Number of trainings that have not ended. Default: 0.
+        have_others_failed: Whether a training of every other candidate failed in the race. Default: False.
     """
 
     chosen: int
@@ -116,6 +118,8 @@ class Judgement:
     n_planned: int
     others: tuple[int, ...]
     settings: Mapping[str, str]
+    n_unjudged: int = 0
+    have_others_failed: bool = False
 
     @property
     def notes(self) -> list[str]:
@@ -148,14 +152,21 @@ class Judgement:
     @property
     def statement(self) -> str:
         """The comparison with the control in a sentence."""
+        if self.chosen == CONTROL and self.have_others_failed:
+            return "The default configuration was chosen, because trainings of all other candidates have failed."
         if self.chosen == CONTROL:
             return (
                 "No setting beat the default configuration: of all candidates, the control was the best on the "
                 "validation volumes."
             )
         name = name_of(self.chosen).capitalize()
-        if not self.differences:
+        if not self.differences and self.n_unjudged:
             return f"{name} was chosen; it has not been judged beside the control yet."
+        if not self.differences:
+            return (
+                f"{name} was chosen, but it cannot be compared with the control: {self.n_seeds} of {self.n_planned} "
+                "seeds were trained to their end with both."
+            )
         first = self.differences[0]
         if math.isnan(first.paired.low):
             return f"{name} was chosen; one seed does not show whether it is better than the control."
@@ -184,6 +195,7 @@ def judge(final: FinalEvaluation) -> Judgement | None:
     differences = _differences(final.search, *pairs) if seeds and chosen != CONTROL else ()
     others = sorted({number for number, _ in judged} - set(both))
     results, searched = tuple(final_results(now)), final.search.get_trials(deepcopy=False)
+    of_others = [standing for number, standing in race.standings.items() if number != CONTROL]
     return Judgement(
         chosen=chosen,
         results=results,
@@ -192,6 +204,8 @@ def judge(final: FinalEvaluation) -> Judgement | None:
         n_planned=len(final.judge_seeds),
         others=tuple(others),
         settings={name_of(each.number): " ".join(overrides_of(settings_of(searched, each.number))) for each in results},
+        n_unjudged=final.n_unjudged,
+        have_others_failed=bool(of_others) and all(standing.has_failed for standing in of_others),
     )
 
 

@@ -59,6 +59,11 @@ def read_settings(overrides: Sequence[str]) -> tuple[StudySettings, Task, DictCo
             f"study.sampler is {settings.sampler['_target_']}, which executes what the storage of the study holds: "
             "give study/sampler=cmaes"
         )
+    if isinstance(sampler, CmaEsSampler) and len(settings.objectives) > 1:
+        raise InvalidValueError(
+            f"study.sampler is cmaes, which searches for one objective, but study.objectives has "
+            f"{len(settings.objectives)}: give study/sampler=tpe"
+        )
     make("pruner", settings.pruner, BasePruner)
     if settings.terminator is not None:
         make_terminator(settings).check(len(settings.objectives), len(settings.seeds))

@@ -87,5 +87,7 @@ def constrained(run: Run, constraints: Sequence[Constraint]) -> Run:
 def _keep(trial: Trial, violations: Mapping[str, float]) -> None:
     # A new object: writes that the trial has cached may have been lost with the connection.
     again = Trial(trial.study, trial._trial_id)
-    for name in violations.keys() - again.constraints.keys():
-        again.set_constraint(name, violations[name])
+    stored = again.constraints
+    for name, violation in violations.items():
+        if name not in stored:
+            again.set_constraint(name, violation)

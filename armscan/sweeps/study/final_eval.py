@@ -22,7 +22,7 @@ from armscan.sweeps.scheduling.population import searched_values
 from armscan.sweeps.scheduling.race import MAX_SEEDS_FACTOR, Race, Scores, budget, race
 from armscan.sweeps.scheduling.state import CONTROL, PlannedTrial
 from armscan.sweeps.space.parameter import Value
-from armscan.sweeps.storage.attribute_names import FINAL_SEED, FINALIST, RETRIED, SCHEDULE
+from armscan.sweeps.storage.attribute_names import FINAL_SEED, FINALIST, RESET_FAILURES, RETRIED, SCHEDULE
 from armscan.sweeps.storage.attributes import FINAL_SUFFIXES, JUDGEMENT_SUFFIX, SELECTION_SUFFIX, check_trials
 from armscan.sweeps.storage.storage import Storage
 from armscan.sweeps.study.settings import (
@@ -152,7 +152,7 @@ class FinalEvaluation:
     def scores(self) -> dict[int, dict[int, float]]:
         """Return the score of each ended training of the selection, by candidate and seed; NaN if it failed."""
         scores: dict[int, dict[int, float]] = {number: {} for number in self.candidates()}
-        for trial in self.selection.get_trials(deepcopy=False):
+        for trial in _counted(self.selection):
             number, seed = training_of(trial)
             if number not in scores:
                 continue
@@ -188,8 +188,18 @@ class FinalEvaluation:
         judged = to_judge(self.race())
         return self._planned([(number, seed) for seed in self.judge_seeds for number in judged], self.judgement)
 
+    @property
+    def n_unjudged(self) -> int:
+        """Number of trainings of the judgement, as far as they are known, that have not ended."""
+        ended = {
+            training_of(trial)
+            for trial in _counted(self.judgement)
+            if trial.state.is_finished() and RETRIED not in trial.user_attrs
+        }
+        return len({(number, seed) for number in to_judge(self.race()) for seed in self.judge_seeds} - ended)
+
     def _planned(self, trainings: Iterable[tuple[int, int]], study: optuna.Study) -> list[PlannedTrial]:
-        begun = set(map(training_of, study.get_trials(deepcopy=False)))
+        begun = set(map(training_of, _counted(study)))
         searched = self.search.get_trials(deepcopy=False)
         return [
             PlannedTrial(settings_of(searched, number), _attributes(searched, number, seed))
@@ -206,6 +216,12 @@ def to_judge(race: Race) -> list[int]:
     if race.chosen is None:
         return [] if race.is_over else [CONTROL]
     return list(dict.fromkeys((race.chosen, CONTROL)))
+
+
+def _counted(study: optuna.Study) -> list[FrozenTrial]:
+    """Return the trials of a study but those whose failure is forgiven, which are run again."""
+    forgiven = study.user_attrs.get(RESET_FAILURES, ())
+    return [trial for trial in study.get_trials(deepcopy=False) if trial.number not in forgiven]
 
 
 def training_of(trial: FrozenTrial | Trial) -> tuple[int, int]:

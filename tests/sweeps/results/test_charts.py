@@ -3,6 +3,7 @@
 import html
 
 import optuna
+import pytest
 from optuna.study import StudyDirection
 from optuna.trial import create_trial
 
@@ -20,6 +21,15 @@ def test_best_so_far_is_of_trials_that_keep_all_constraints():
         "infeasible trial": [(1, 1.0)],
         "best so far": [(0, 3.0), (2, 2.0)],
     }
+
+
+@pytest.mark.parametrize(("n_objectives", "n_fronts"), [(1, 0), (2, 1), (3, 1), (4, 0)])
+def test_front_is_drawn_of_two_or_three_objectives(n_objectives, n_fronts):
+    study = optuna.create_study(directions=["minimize"] * n_objectives)
+    study.tell(study.ask(), [1.0] * n_objectives)
+    names = ["mean_steps", "mean_return", "success_rate", "training_s"][:n_objectives]
+    shown = "".join(charts_of(study, study.trials, names, []))
+    assert shown.count("Trials that no other is better than") == n_fronts
 
 
 def test_names_of_objectives_in_a_storage_are_escaped():

@@ -7,7 +7,7 @@ from optuna.trial import TrialState
 
 from armscan.sweeps.results.console import print_result
 from armscan.sweeps.scheduling.state import CONTROL, FAILURES_AT_ONCE
-from armscan.sweeps.storage.attribute_names import FINAL_SEED, FINALIST
+from armscan.sweeps.storage.attribute_names import FINAL_SEED, FINALIST, METRICS
 from armscan.sweeps.study.settings import FinalEvalSettings
 
 
@@ -33,6 +33,23 @@ def test_study_whose_workers_have_ended_before_its_trials_can_be_resumed(study, 
 def test_study_whose_final_trainings_are_missing_can_be_resumed(searched, capsys):
     assert print_result(searched) == os.EX_TEMPFAIL
     assert "trainings are missing; the same command resumes the study" in capsys.readouterr().err
+
+
+def test_study_whose_judgement_is_incomplete_can_be_resumed(searched, capsys):
+    selection, judgement = (phase.scheduler for phase in searched.finals)
+
+    def train(scheduler):
+        if trial := scheduler.claim({}):
+            trial.set_user_attr(METRICS, {"test/success_rate": 1.0})
+            trial.study.tell(trial, 2.0 if trial.user_attrs[FINALIST] == CONTROL else 1.0)
+        return trial is not None
+
+    while train(selection):
+        pass
+    for n_left, code in ((1, os.EX_TEMPFAIL), (0, 0)):
+        assert train(judgement)
+        assert print_result(searched) == code
+        assert (f"trainings on the test volumes are missing ({n_left}); the" in capsys.readouterr().err) == bool(code)
 
 
 def test_failed_study_is_not_worth_the_same_command(study):

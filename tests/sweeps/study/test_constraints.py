@@ -53,6 +53,15 @@ def test_constraints_are_read_from_the_command_line_and_name_metrics_of_a_trial(
         read_settings(["sweep=sac_y", "study.constraints=much"])
 
 
+def test_constraints_are_stored_in_the_order_in_which_they_are_written():
+    texts = [f"env_steps <= {bound}" for bound in range(20)]
+    study = optuna.create_study()
+    attempt = Attempt(study.ask())
+    constrained(lambda _: {"env_steps": 5.0}, [Constraint.read(text) for text in texts])(attempt)
+    attempt.writes.write()
+    assert list(study.trials[0].constraints) == texts
+
+
 @pytest.mark.parametrize("directions", [["minimize"], ["minimize", "minimize"]], ids=["one", "two"])
 def test_trial_that_violates_a_constraint_is_never_best(storage_uri, directions):
     storage = open_storage(storage_uri)

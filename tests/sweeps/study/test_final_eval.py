@@ -161,6 +161,43 @@ def test_control_is_judged_during_the_race_and_the_chosen_configuration_after_it
     assert judge(final).chosen == 1
 
 
+def test_study_whose_judgement_was_interrupted_says_how_many_trainings_are_missing(storage_uri):
+    final, schedulers = opened(storage_uri)
+    for scheduler, n_claims in zip(schedulers, (100, 5), strict=True):
+        for _ in range(n_claims):
+            if trial := scheduler.claim({}):
+                end(scheduler, trial, TRUE)
+    # Three seeds of the chosen configuration and of the control.
+    assert final.n_unjudged == 1
+    assert judge(final).n_unjudged == 1
+    run(storage_uri)
+    assert final.n_unjudged == 0
+
+
+def test_control_whose_trainings_failed_leaves_no_comparison_and_the_result_says_so(storage_uri):
+    final, (selection, judgement) = opened(storage_uri)
+    while trial := selection.claim({}):
+        end(selection, trial, TRUE)
+    while trial := judgement.claim({}):
+        if trial.user_attrs[FINALIST] == CONTROL:
+            judgement.study.tell(trial, state=TrialState.FAIL)
+        else:
+            end(judgement, trial, TRUE)
+    expected = "Trial 1 was chosen, but it cannot be compared with the control: 0 of 3 seeds were trained"
+    assert judge(final).statement.startswith(expected)
+
+
+def test_control_that_no_candidate_completed_the_race_beside_has_beaten_none(storage_uri):
+    final, (selection, _) = opened(storage_uri)
+    while trial := selection.claim({}):
+        if trial.user_attrs[FINALIST] == CONTROL:
+            end(selection, trial, TRUE)
+        else:
+            selection.study.tell(trial, state=TrialState.FAIL)
+    expected = "The default configuration was chosen, because trainings of all other candidates have failed."
+    assert judge(final).statement == expected
+
+
 def test_control_that_was_judged_before_the_chosen_configuration_is_not_its_result(storage_uri):
     final, (selection, judgement) = opened(storage_uri)
     for scheduler in (judgement, selection):
@@ -352,6 +389,16 @@ def test_nothing_is_left_of_a_final_evaluation_whose_trainings_all_failed(storag
     assert final.race().chosen is None
     assert final_trainings_left(searched(storage_uri)[1], final, n_left=0) == (0, 0)
     assert final.missing_of_judgement() == []
+
+
+def test_trainings_that_failed_before_a_restart_are_run_again(storage_uri):
+    final, (selection, _) = opened(storage_uri)
+    selection.limits = selection.limits.model_copy(update={"max_failures": 2})
+    while trial := selection.claim({}):
+        fail(selection, trial, "diverged")
+    assert selection.reset_failures() >= 2
+    run(storage_uri)
+    assert final.race().chosen == 1
 
 
 def test_training_of_the_final_evaluation_cannot_be_stopped_alone(storage_uri):

@@ -54,6 +54,12 @@ def test_cmaes_draws_what_optunas_own_draws(variant):
     assert points[0] == points[1]
 
 
+def test_cmaes_is_refused_for_several_objectives():
+    words = ["sweep=speed_vs_success", "study/sampler=cmaes"]
+    with pytest.raises(InvalidValueError, match=r"cmaes, which searches for one objective, but .* has 2: give study/"):
+        read_settings(words)
+
+
 def test_optunas_own_cmaes_is_refused():
     words = ["sweep=sac_y", "study/sampler=cmaes", "study.sampler._target_=optuna.samplers.CmaEsSampler"]
     with pytest.raises(InvalidValueError, match=r"CmaEsSampler, which executes .* study/sampler=cmaes"):
