@@ -113,28 +113,36 @@ class LookNetwork(nn.Module):
         self.register_buffer("units", torch.tensor(UNITS))
         self.register_buffer("places", torch.tensor(PLACE_UNITS))
 
-    def forward(
-        self, images: Tensor, actions: Tensor, step: Tensor, geometry: PlaneGeometry
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def earlier_places(self, planes: Tensor, geometry: PlaneGeometry) -> Tensor:
+        """Return where the earlier looks that the network sees lie, latest first, shape (n, 4 * (n_seen - 1)).
+
+        Not in `forward`, which may compute in 16 bits.
+
+        Args:
+            planes: Planes of the looks, shape (n, n_looks, 4).
+            geometry: Free components and bounds of the planes, in degrees and mm.
+        """
+        if (n_earlier := self._n_seen - 1) == 0:
+            return planes[:, 0, :0]
+        earlier, latest = planes[:, -n_earlier - 1 : -1].flip(1), planes[:, -1:].expand(-1, n_earlier, -1)
+        places = geometry.seen_from(latest.flatten(0, 1), earlier.flatten(0, 1)) / self.places
+        return places.clamp(-MAX_PLACE, MAX_PLACE).reshape(-1, 4 * n_earlier)
+
+    def forward(self, images: Tensor, action: Tensor, step: Tensor, earlier: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the place of the labelled plane, its expected errors, both above 0, and the features of both.
 
         Args:
             images: Looks of an episode, oldest first, bytes of shape (n, n_looks, tissues, across, depth).
-            actions: Planes of the looks, normalised, shape (n, n_looks, 4).
+            action: Plane of the latest look, normalised, shape (n, 4).
             step: Number of the latest look, one-hot, shape (n, n_looks).
-            geometry: Free components and bounds of the planes, in degrees and mm.
+            earlier: Result of `earlier_places`.
 
         Returns:
             Tensors of shape (n, 4), (n, 2) and (n, hidden_sizes[-1]).
         """
         looks = images[:, -self._n_seen :].flatten(1, 2).float() / 255.0
-        planes = geometry.planes(actions)
-        features = [self.convolutions(looks.contiguous(memory_format=torch.channels_last)), actions[:, -1], step]
-        if (n_earlier := self._n_seen - 1) > 0:
-            earlier, latest = planes[:, -n_earlier - 1 : -1].flip(1), planes[:, -1:].expand(-1, n_earlier, -1)
-            places = geometry.seen_from(latest.flatten(0, 1), earlier.flatten(0, 1)) / self.places
-            features.append(places.clamp(-MAX_PLACE, MAX_PLACE).reshape(-1, 4 * n_earlier))
-        hidden = self.linear(torch.cat(features, dim=1))
+        seen = self.convolutions(looks.contiguous(memory_format=torch.channels_last))
+        hidden = self.linear(torch.cat([seen, action, step, earlier], dim=1))
         expected = nn.functional.softplus(self.doubt(hidden.detach())) + MIN_EXPECTED
         return self.place(hidden) * self.units, expected, hidden
 
@@ -194,8 +202,10 @@ class FinderModule(nn.Module):
         n_equal = is_first @ (latest[:, None] <= latest).float()
         n_first = (n_equal == latest + 1.0).sum(1)
         step = ((n_looks - n_first)[:, None] == latest).float()
-        place, expected, hidden = self.network(observations[IMAGE], actions, step, self.geometry)
-        return Estimate(self.geometry.planes(actions[:, -1]), place, expected * self.calibration, step, hidden)
+        planes = self.geometry.planes(actions)
+        earlier = self.network.earlier_places(planes, self.geometry)
+        place, expected, hidden = self.network(observations[IMAGE], actions[:, -1], step, earlier)
+        return Estimate(planes[:, -1], place, expected * self.calibration, step, hidden)
 
     def found(self, observations: dict[str, Tensor]) -> Estimate:
         """Return the estimate at the latest look, its place averaged over the latest `n_averaged` estimates."""

@@ -10,7 +10,7 @@ from gymnasium import spaces
 from armscan.agents.finder_parameters import FinderParameters
 from armscan.agents.protocols import AgentSetup
 from armscan.agents.tianshou_imports import import_tianshou
-from armscan.envs.actions import COMPONENTS
+from armscan.envs.actions import COMPONENTS, STOP
 from armscan.errors import InvalidValueError
 
 if TYPE_CHECKING:
@@ -55,6 +55,10 @@ class PlaneFinder(FinderParameters):
                 "all that it needs"
             )
         check_observed(setup.observation_space, self.n_looks)
+        if self.sure_mm is not None and STOP not in setup.action_names:
+            raise InvalidValueError(
+                f"agent.sure_mm is {self.sure_mm}, but an agent that is sure can only stop with env.ends=on_stop"
+            )
         n_at_once = self.num_envs * self.n_looks
         if n_at_once > setup.total_env_steps:
             raise InvalidValueError(

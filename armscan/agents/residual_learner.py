@@ -18,7 +18,7 @@ from armscan.agents.residual_envs import ResidualVectorEnv, feature_space
 from armscan.agents.sac import SAC
 from armscan.envs.actions import COMPONENTS
 from armscan.envs.rules import Observed
-from armscan.errors import InvalidValueError
+from armscan.errors import DivergedError, InvalidValueError
 from armscan.utils.arrays import FloatArray
 
 
@@ -105,9 +105,7 @@ class ResidualLearner(PlaneFinderLearner):
             self._sac = sac.agent(sac_setup)
         except InvalidValueError as error:
             budget = "training.env_steps"
-            message = (
-                str(error).replace("agent.", "agent.sac.").replace(budget, f"{budget} - agent.pretraining_env_steps")
-            )
+            message = _of_sac(error).replace(budget, f"{budget} - agent.pretraining_env_steps")
             raise InvalidValueError(message) from error
         self._network = self._module = self._corrected = ResidualModule(finder, self._sac.actor, limits)
 
@@ -134,7 +132,10 @@ class ResidualLearner(PlaneFinderLearner):
             self._sac.warm_up()
             self._corrected.is_corrected.fill_(1.0)
             n_env_steps = max(1, n_env_steps - self._sac.n_env_steps)
-        return self._sac.learn(n_env_steps)
+        try:
+            return self._sac.learn(n_env_steps)
+        except DivergedError as error:
+            raise DivergedError(_of_sac(error)) from error
 
     def act(self, observation: Observed, reward: float) -> FloatArray:
         """Return the next plane, shape (n_action,); the errors of corrected planes are not expected."""
@@ -152,3 +153,8 @@ class ResidualLearner(PlaneFinderLearner):
         """Restore what `state` returned; see `Learner.load_state`."""
         super().load_state(state)
         self._sac.load_state(state["sac"])
+
+
+def _of_sac(error: Exception) -> str:
+    """Return the message of an error of SAC with the keys that its hyperparameters have here."""
+    return str(error).replace("agent.", "agent.sac.")

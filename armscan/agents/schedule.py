@@ -71,6 +71,12 @@ def scheduled_algorithms(algorithm: Algorithm, schedule: Sequence[Segment]) -> l
                 f"training.schedule[{number}] changes {AGENT}{wrong[0]}, but during a training of "
                 f"{type(algorithm).__name__} only this can change: {keys}"
             )
+        pretraining = getattr(algorithm, "pretraining_env_steps", None)
+        if pretraining is not None and segment.from_env_steps >= pretraining:
+            raise InvalidValueError(
+                f"training.schedule[{number}].{FROM} is {segment.from_env_steps}, but it must be below "
+                f"agent.pretraining_env_steps = {pretraining}: only the pretraining has a schedule"
+            )
         changing: Any = algorithm
         algorithm = dataclasses.replace(changing, **segment.values)
         algorithms.append((segment.from_env_steps, algorithm))

@@ -253,6 +253,7 @@ def test_environments_that_do_not_fit_are_refused(phantom, rules, message):
         ({"average_tilts": "no"}, "agent.average_tilts is 'no', but it must be true or false"),
         ({"n_averaged": 4}, "agent.n_averaged is 4, but it must be at most 3"),
         ({"sure_mm": 1.0}, "both or none"),
+        ({"sure_mm": 1.0, "sure_deg": 2.0}, "agent.sure_mm is 1.0, but .* can only stop with env.ends=on_stop"),
         ({"filters": (2, 2)}, "agent.filters"),
         ({"lr": 0.0}, "agent.lr"),
         ({"phantom_share": 1.5}, "agent.phantom_share is 1.5"),
@@ -287,3 +288,16 @@ def test_learner_computes_in_mixed_precision(phantom):
     # Learning and acting alike.
     assert 0 < n_taught < len(computed)
     assert set(computed) == {torch.bfloat16}
+
+
+def test_places_of_earlier_looks_are_computed_in_32_bits_beside_mixed_precision(phantom):
+    env_factory = EnvFactory(**RULES)
+    setup = setup_for(env_factory, phantom, action_names=NAMES, total_env_steps=480, compute=Compute("cpu", "bfloat16"))
+    module, seen = PlaneFinder(**SMALL).agent(setup)._module, []
+    module.network.linear[0].register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0][:, -8:]))
+    observation = env_factory.make_env([phantom]).reset(seed=0)[0]
+    observation["action"] = np.random.default_rng(0).uniform(-0.1, 0.1, observation["action"].shape)
+    module.estimate({name: part.float() for name, part in batch_of([observation]).items()})
+    geometry = module.geometry.to("cpu", torch.float32)
+    planes = geometry.planes(torch.as_tensor(observation["action"][None], dtype=torch.float32))
+    torch.testing.assert_close(seen[0], module.network.earlier_places(planes, geometry))

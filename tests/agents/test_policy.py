@@ -21,7 +21,10 @@ def observed(env, n=N_OBSERVED):
     env.action_space.seed(0)
     observations = [env.reset(seed=0)[0]]
     while len(observations) < n:
-        observations.append(env.step(env.action_space.sample())[0])
+        action = env.action_space.sample()
+        # A component `stop` above 0 would end the episode.
+        action[4:] = -1.0
+        observations.append(env.step(action)[0])
     return observations
 
 

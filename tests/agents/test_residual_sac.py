@@ -13,7 +13,7 @@ from armscan.agents.torch_export import export_program
 from armscan.config.compose import compose
 from armscan.config.error_messages import one_line_message
 from armscan.envs import EnvFactory
-from armscan.errors import InvalidValueError
+from armscan.errors import DivergedError, InvalidValueError
 from armscan.experiment.agent import make_algorithm
 from armscan.training import evaluate
 from armscan.training.episodes import play
@@ -159,6 +159,16 @@ def test_learner_stops_where_its_plane_finder_does(phantom):
 def test_impossible_parameters_are_refused(phantom, changes, message):
     with pytest.raises(InvalidValueError, match=message):
         made(phantom, **changes)
+
+
+def test_divergence_of_sac_names_its_keys(phantom):
+    learner, _ = made(phantom)
+    learner.learn(24)
+    learner.learn(48)
+    for weight in learner._sac._algorithm.policy.actor.parameters():
+        weight.data.fill_(float("nan"))
+    with pytest.raises(DivergedError, match=r"a smaller agent\.sac\.lr or agent\.sac\.ent_coef_lr may help"):
+        learner.learn(48)
 
 
 def test_what_sac_refuses_is_named_by_its_keys(phantom):

@@ -3,7 +3,17 @@
 import pytest
 import torch
 
-from armscan.agents import MLP, PPO, SAC, Exhaustive, Learner, ScheduledLearner, Segment, scheduled_algorithms
+from armscan.agents import (
+    MLP,
+    PPO,
+    SAC,
+    Exhaustive,
+    Learner,
+    ResidualSAC,
+    ScheduledLearner,
+    Segment,
+    scheduled_algorithms,
+)
 from armscan.agents.batch_agent import BatchAgent
 from armscan.agents.schedule import read_schedule
 from armscan.errors import InvalidValueError
@@ -132,3 +142,10 @@ def test_schedule_changes_only_what_can_change_to_what_is_allowed(algorithm, val
     with pytest.raises(InvalidValueError) as raised:
         scheduled_algorithms(algorithm, [Segment(40, values)])
     assert line in str(raised.value)
+
+
+def test_schedule_of_residual_sac_ends_with_its_pretraining():
+    residual = ResidualSAC(sac=SAC(network=MLP()), pretraining_env_steps=40)
+    assert scheduled_algorithms(residual, [Segment(39, {"lr": 1e-4})])[0][1].lr == 1e-4
+    with pytest.raises(InvalidValueError, match=r"from_env_steps is 40, .* below agent.pretraining_env_steps = 40"):
+        scheduled_algorithms(residual, [Segment(39, {"lr": 1e-4}), Segment(40, {"lr": 1e-5})])

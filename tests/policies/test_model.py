@@ -48,7 +48,7 @@ print([name for name in ("armscan", "tianshou", "gymnasium") if name in sys.modu
 
 def learner_of(algorithm, made_of, phantom):
     if (algorithm, made_of) == FINDER:
-        learner, env = made_finder(phantom, {"max_steps": 50}, sure_mm=1e9, sure_deg=10.0)
+        learner, env = made_finder(phantom, {"ends": "on_stop", "max_steps": 50}, sure_mm=1e9, sure_deg=10.0)
         learner.learn(24)
         return learner, env
     kind, small = ALGORITHMS[algorithm]
