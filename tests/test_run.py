@@ -113,6 +113,7 @@ def test_run_trains_evaluates_and_tracks(tmp_path, monkeypatch):
 
 
 @pytest.mark.full
+@pytest.mark.usefixtures("database")
 def test_run_of_the_same_seed_gives_the_same_figures(tmp_path):
     for _ in range(2):
         assert armscan_run(*SMALL, "seed=3", cwd=tmp_path).returncode == 0
@@ -124,6 +125,7 @@ def test_run_of_the_same_seed_gives_the_same_figures(tmp_path):
 
 
 @pytest.mark.full
+@pytest.mark.usefixtures("database")
 def test_run_says_when_it_validates_where_the_agent_takes_more_steps_at_once_than_an_epoch_has(tmp_path):
     words = [word for word in SMALL if not word.startswith("agent.learning_starts")]
     ended = armscan_run(*words, "agent=ppo", "agent.env_steps_per_collection=250", cwd=tmp_path)
@@ -134,6 +136,7 @@ def test_run_says_when_it_validates_where_the_agent_takes_more_steps_at_once_tha
 
 
 @pytest.mark.full
+@pytest.mark.usefixtures("database")
 def test_multirun_runs_its_jobs_as_children_and_a_failed_one_stops_no_other(tmp_path):
     varied = ["-m", "obs=cluster,action_reward", "env.success_threshold=0.05,7"]
     ended = armscan_run(*varied, "projection=zy", "stack=2", "memory=1", *SMALL, cwd=tmp_path)
@@ -175,6 +178,7 @@ def test_multirun_runs_its_jobs_as_children_and_a_failed_one_stops_no_other(tmp_
 
 
 @pytest.mark.full
+@pytest.mark.usefixtures("database")
 def test_folds_are_a_grid_with_one_table_over_all_of_them(tmp_path, data_folder):
     few = ["agent=random", "evaluation.episodes=2", "tracking.policy=false"]
     words = ["data=nifti", f"data.path={data_folder}", "data.folds=2", "data.validation=0.25", *few]
@@ -196,6 +200,7 @@ def test_folds_are_a_grid_with_one_table_over_all_of_them(tmp_path, data_folder)
 
 
 @pytest.mark.full
+@pytest.mark.usefixtures("database")
 def test_grid_that_configures_hydra_says_that_resuming_it_needs_trust(tmp_path):
     ended = armscan_run("-m", "seed=0,-1", "agent=random", "hydra.launcher.n_jobs=1", *FEW, cwd=tmp_path)
     assert ended.returncode == 1
@@ -207,6 +212,7 @@ def test_grid_that_configures_hydra_says_that_resuming_it_needs_trust(tmp_path):
 
 
 @pytest.mark.full
+@pytest.mark.usefixtures("database")
 def test_agents_that_do_not_learn_are_evaluated_and_tracked_side_by_side(tmp_path):
     few = [word for word in SMALL if not word.startswith(("agent.", "network"))]
     ended = armscan_run("-m", "agent=exhaustive,optuna", "projection=zy", *few, cwd=tmp_path)
@@ -230,6 +236,7 @@ def test_agents_that_do_not_learn_are_evaluated_and_tracked_side_by_side(tmp_pat
 
 
 @pytest.mark.full
+@pytest.mark.usefixtures("database")
 def test_run_on_labelmap_files(tmp_path, data_folder):
     arguments = ["data=nifti", f"data.path={data_folder}", *(word for word in SMALL if not word.startswith("data."))]
     ended = armscan_run(*arguments, cwd=tmp_path)

@@ -98,6 +98,7 @@ def assert_ended_alike(cwd):
 
 
 @pytest.mark.full
+@pytest.mark.usefixtures("database")
 def test_run_killed_while_it_writes_a_checkpoint_goes_on_and_ends_as_if_it_had_not_been(tmp_path):
     killed(lambda printed: after_epochs(1)(printed) and unfinished(tmp_path), *LONGER, cwd=tmp_path, command=SLOWLY)
     assert unfinished(tmp_path)

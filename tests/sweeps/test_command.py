@@ -78,6 +78,7 @@ def check_result(folder):
 
 
 @pytest.mark.full
+@pytest.mark.usefixtures("database")
 def test_study_runs_its_trials_judges_the_best_and_goes_on_when_it_is_asked_for_more(tmp_path, monkeypatch):
     ended = armscan_run(*TINY, "study.n_trials=2", cwd=tmp_path)
     assert ended.returncode == 0, ended.stderr
