@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from armscan.anatomy import PIXEL_TISSUES, LandmarkReward, Reward, Scanner, Tissues
+from armscan.anatomy import PIXEL_TISSUES, LandmarkReward, Scanner, Tissues
 from armscan.envs.episode import Episode
 from armscan.envs.observations import SliceGeometry, View
 from armscan.envs.panels import (
@@ -116,13 +116,7 @@ def draw_plane(
     return np.asarray(picture)
 
 
-def view_of(
-    volume: LabelVolume,
-    plane: ManipulatorAction,
-    *,
-    tissues: Tissues = PIXEL_TISSUES,
-    reward: Reward = LandmarkReward(),  # noqa: B008 - it is not changed
-) -> View:
+def view_of(volume: LabelVolume, plane: ManipulatorAction, *, tissues: Tissues = PIXEL_TISSUES) -> View:
     """Look at a plane of an unmoved volume, outside an episode.
 
     Returns:
@@ -136,7 +130,7 @@ def view_of(
         geometry=SliceGeometry(volume.slice_shape, volume.pixel_mm),
         smallest_shape=volume.slice_shape,
         action=np.zeros(0),
-        reward=reward.score(landmarks, volume.pixel_mm),
+        reward=LandmarkReward().score(landmarks, volume.pixel_mm),
     )
 
 

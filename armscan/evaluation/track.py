@@ -87,10 +87,10 @@ def evaluate_and_track(
         own = FOLDER / f"{file_name(f'{source.name}-{data}')}-{tracked.run_id[:8]}{SUFFIX}"
         file = out or own
         text = json.dumps(report.to_dict(), indent=1, allow_nan=False)
-        atomic_write(file, lambda opened: opened.write(text.encode()), follow_link=True)
+        atomic_write(file, text, follow_link=True)
         shown = own.with_suffix(".html")
         contents = _html(tracked.name, report, applied.notes)
-        atomic_write(shown, lambda opened: opened.write(contents.encode()))
+        atomic_write(shown, contents)
         tracked.log_files(file, shown)
     return report, file
 

@@ -13,7 +13,7 @@ from armscan.config.defaults import PHANTOM
 from armscan.config.error_messages import one_line_message
 from armscan.errors import InvalidValueError
 from armscan.evaluation.agent_source import TrainedAgent
-from armscan.training import PARTS, TEST, TRAINING, VALIDATION, Split, check_unchanged, fingerprint
+from armscan.training import PARTS, TEST, TRAINING, VALIDATION, Split, check_unchanged
 from armscan.utils.files import check_writable
 from armscan.volumes import LabelVolume, load_phantoms, open_dataset
 from armscan.volumes.dataset import SPLITS
@@ -112,7 +112,7 @@ def known_volumes(source: TrainedAgent, groups: Mapping[str, Volumes]) -> list[s
     """
     assert source.run is not None
     volumes = {name: volume for group in groups.values() for name, volume in group.items()}
-    prints = {name: fingerprint(volume) for name, volume in volumes.items()} if source.volumes else {}
+    prints = {name: volume.fingerprint for name, volume in volumes.items()} if source.volumes else {}
     notes = []
     for part, what in (
         ("training", "the agent was trained on"),

@@ -87,7 +87,7 @@ class Job:
         """Write the outcome for the process that launched the job."""
         outcome = JobOutcome(self.overrides, self.varied, failure, metrics or {})
         file = self.folder / OUTCOME_FOLDER / f"{self.number}.json"
-        atomic_write(file, lambda opened: opened.write(json.dumps(asdict(outcome)).encode()))
+        atomic_write(file, json.dumps(asdict(outcome)))
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,6 @@ import json
 import shutil
 import socket
 from collections.abc import Mapping
-from operator import methodcaller
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +73,7 @@ def start_tracking(
     _remove_earlier(invocation.folder)
     # Before the run exists, so that it can be resumed whenever it is killed.
     for name, contents in files.items():
-        atomic_write(invocation.folder / name, methodcaller("write", contents))
+        atomic_write(invocation.folder / name, contents)
     tracked = TrackedRun.start(
         client,
         experiment_id,

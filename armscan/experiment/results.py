@@ -7,7 +7,6 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from operator import methodcaller
 from pathlib import Path
 
 from armscan.agents.baselines import RandomAgent
@@ -130,10 +129,10 @@ class RunResult:
         """Write all episodes, and a page with the table, to the folder of the run."""
         for file, evaluations in ((EVALUATION_FILE, self.evaluations), (BASELINES_FILE, self.baselines)):
             contents = {name: evaluation.to_dict() for name, evaluation in evaluations.items()}
-            atomic_write(folder / file, methodcaller("write", json.dumps(contents, indent=1).encode()))
+            atomic_write(folder / file, json.dumps(contents, indent=1))
         notes = "".join(f"<p>{html.escape(note)}</p>" for note in self.notes())
         text = page(title, f"{self.table().html()}{notes}")
-        atomic_write(folder / RESULTS_PAGE, methodcaller("write", text.encode()))
+        atomic_write(folder / RESULTS_PAGE, text)
 
 
 def result_table(figures: Mapping[str, MetricEstimates]) -> ResultTable:

@@ -6,7 +6,6 @@ import html
 import json
 import math
 from collections.abc import Iterable, Sequence
-from operator import methodcaller
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -93,7 +92,7 @@ def keep_table(
     file = folder / RESULTS_PAGE
     said = "".join(f"<p>{html.escape(note)}</p>" for note in notes)
     text = page("all folds (test)", f"{said}{table.html()}<h2>Jobs</h2>{jobs.html()}")
-    atomic_write(file, methodcaller("write", text.encode()))
+    atomic_write(file, text)
     time_ms = now_ms()
     groups = {title: TEST_GROUP if title == AGENT else title.removesuffix(ALL_FOLDS) for title in table.results}
     metrics = [

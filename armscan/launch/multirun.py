@@ -8,7 +8,6 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from operator import methodcaller
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -196,7 +195,7 @@ def _keep_page(table: ResultTable, folder: Path, parent: Mapping[str, Any], stor
 
     file, n_jobs = folder / RESULTS_PAGE, sum(map(bool, table.facts["outcome"]))
     body = f"<p><code>{html.escape(' '.join(parent['overrides']))}</code></p>{table.html()}"
-    atomic_write(file, methodcaller("write", page(f"Grid of {n_jobs} job{'s' if n_jobs > 1 else ''}", body).encode()))
+    atomic_write(file, page(f"Grid of {n_jobs} job{'s' if n_jobs > 1 else ''}", body))
     store.log_artifact(parent["run_id"], str(file))
     set_description(store, parent["run_id"], table.markdown())
 

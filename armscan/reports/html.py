@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import html
 from collections.abc import Mapping, Sequence
-from operator import methodcaller
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -132,7 +131,7 @@ def write_page(
     file = folder / REPORT_FILE
     text = page(title, body, script=get_plotlyjs(), refresh_s=refresh_s)
     # A browser may be reading it.
-    atomic_write(file, methodcaller("write", text.encode()))
+    atomic_write(file, text)
     return file
 
 

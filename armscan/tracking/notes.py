@@ -53,7 +53,7 @@ class Note:
     def write(self, file: Path) -> None:
         """Write the note to a file."""
         told = {"outbox": str(self.outbox), "uri": self.uri, "process": asdict(self.process)}
-        atomic_write(file, lambda opened: opened.write(json.dumps(told).encode()))
+        atomic_write(file, json.dumps(told))
 
     @property
     def is_abandoned(self) -> bool:

@@ -195,8 +195,7 @@ class Outbox(OutboxFile):
         file = file_of(folder, address.run_id)
         file.parent.mkdir(parents=True, exist_ok=True)
         if not file.exists():
-            first = json.dumps({"address": asdict(address)}).encode() + b"\n"
-            atomic_write(file, lambda opened: opened.write(first))
+            atomic_write(file, json.dumps({"address": asdict(address)}) + "\n")
         return cls(file)
 
     def add(self, **entry: Any) -> None:
@@ -216,8 +215,7 @@ class Outbox(OutboxFile):
     def mark(self, channel: Channel, end: int) -> None:
         """Record how far a channel is uploaded."""
         self._uploaded[channel] = end
-        text = json.dumps(self._uploaded)
-        atomic_write(self._uploaded_file, lambda opened: opened.write(text.encode()))
+        atomic_write(self._uploaded_file, json.dumps(self._uploaded))
 
     def note(self, uri: str) -> None:
         """Write this machine's note of the run, so that the next start uploads what is left.

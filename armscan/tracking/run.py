@@ -131,7 +131,7 @@ class TrackedRun:
         tracked._log_config(config)
         if (diff := source().diff) and f"resumed.{DIFF_SUM}" in changed:
             file = folder / RESUMED_DIFF_FILE.format(n_resumed)
-            atomic_write(file, lambda opened: opened.write(diff))
+            atomic_write(file, diff)
             tracked.log_files(file)
         return tracked
 

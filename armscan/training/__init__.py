@@ -8,7 +8,7 @@ from armscan.training.checkpoints import CheckpointProvenance, resume_from_check
 from armscan.training.domain import TrainingDomain
 from armscan.training.episode_results import TEST, TRAINING, VALIDATION, EpisodeResult, Evaluation
 from armscan.training.episodes import evaluate
-from armscan.training.fingerprints import Fingerprints, check_unchanged, fingerprint, fingerprints_in
+from armscan.training.fingerprints import Fingerprints, check_unchanged, fingerprints_in
 from armscan.training.metrics import MetricEstimates
 from armscan.training.result_table import ResultTable
 from armscan.training.splits import PARTS, Split, mixed_data, nifti_data, phantom_data
@@ -43,7 +43,6 @@ __all__ = [
     "check_unchanged",
     "evaluate",
     "evaluate_baselines",
-    "fingerprint",
     "fingerprints_in",
     "load_checkpoint",
     "load_weights",

@@ -20,7 +20,6 @@ from armscan.envs.rules import Rules
 from armscan.stats.on_plane import ON_PLANE, OnPlane
 from armscan.training.episode_results import Env, Evaluation
 from armscan.training.episodes import evaluate
-from armscan.training.fingerprints import fingerprint
 from armscan.utils.files import atomic_write, cache_folder
 
 FOLDER = "baselines"
@@ -68,7 +67,7 @@ def _rules_of(rules: Rules) -> str | None:
     parts = (rules.reward, *rules.tissues, *([rules.transform] if rules.transform else []))
     if not all(type(part).__module__.startswith("armscan.") for part in parts):
         return None
-    prints = [(name, fingerprint(volume)) for name, volume in rules.volumes.items()]
+    prints = [(name, volume.fingerprint) for name, volume in rules.volumes.items()]
     shared = (rules.action_names, rules.success_threshold, rules.ends, rules.max_steps, rules.start, rules.bounds)
     return repr((prints, shared, rules.tissues, rules.transform, type(rules.reward), vars(rules.reward), _sources()))
 
@@ -96,8 +95,8 @@ def _cached(file: Path) -> Evaluation | None:
 
 
 def _cache(evaluation: Evaluation, file: Path) -> None:
-    text = json.dumps([asdict(episode) for episode in evaluation.episodes]).encode()
+    text = json.dumps([asdict(episode) for episode in evaluation.episodes])
     # A cache that cannot be written only costs time.
     with contextlib.suppress(OSError):
         file.parent.mkdir(parents=True, exist_ok=True)
-        atomic_write(file, lambda opened: opened.write(text))
+        atomic_write(file, text)

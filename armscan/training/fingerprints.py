@@ -8,15 +8,9 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from armscan.errors import ChangedVolumesError
-from armscan.volumes import LabelVolume
 
 # By split (training, validation, test) and the volume's name.
 Fingerprints = dict[str, dict[str, str]]
-
-
-def fingerprint(volume: LabelVolume) -> str:
-    """Return the SHA-256 of all that an agent can notice of a volume: voxels, spacing and labelled plane."""
-    return volume.fingerprint
 
 
 def fingerprints_in(record: bytes | Any, where: str) -> Fingerprints:

@@ -112,13 +112,8 @@ class MetricEstimates:
         return cls.of(Evaluation(episodes, first.on_plane), trainings)
 
     @classmethod
-    def of_metrics(cls, metrics: Mapping[str, float], *, n_seeds: int = 1) -> MetricEstimates:
-        """Return estimates from the numbers of `metrics` or of a run; without an interval if its ends are missing.
-
-        Args:
-            metrics: Numbers by the name of the metric.
-            n_seeds: Number of trainings that they summarise. Default: 1.
-        """
+    def of_metrics(cls, metrics: Mapping[str, float]) -> MetricEstimates:
+        """Return estimates from the numbers of `metrics` or of a run; without an interval if its ends are missing."""
         ends = {name + end for name in metrics for end in ENDS if name + end in metrics}
         n_volumes, n_episodes, n_started_solved = (int(metrics.get(name, 0)) for name in COUNTS)
         found = {
@@ -126,7 +121,7 @@ class MetricEstimates:
             for name, value in metrics.items()
             if name not in ends and name not in COUNTS
         }
-        return cls(n_seeds, n_volumes, n_episodes, n_started_solved, found, limits_among(found))
+        return cls(1, n_volumes, n_episodes, n_started_solved, found, limits_among(found))
 
     def estimate(self, name: str) -> Estimate:
         """Return a figure as it is shown: NaN if there is none; with Wilson's interval if its own has no width."""

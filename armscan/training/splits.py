@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from armscan.errors import InvalidValueError
-from armscan.training.fingerprints import Fingerprints, fingerprint
+from armscan.training.fingerprints import Fingerprints
 from armscan.training.subject_splits import PHANTOMS, parts_by_subject
 from armscan.utils.validation import MAX_SEED, check_choice, check_int, check_path
 from armscan.volumes import LabelVolume, load_phantoms, open_dataset
@@ -77,8 +77,7 @@ class Split:
     def fingerprints(self) -> Fingerprints:
         """Return a checksum of each volume's contents, by split and name."""
         return {
-            part: {name: fingerprint(volume) for name, volume in volumes.items()}
-            for part, volumes in self.parts.items()
+            part: {name: volume.fingerprint for name, volume in volumes.items()} for part, volumes in self.parts.items()
         }
 
 

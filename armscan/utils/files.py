@@ -69,14 +69,16 @@ def sqlite_file(uri: str) -> Path:
     return Path(uri.removeprefix(SQLITE_PREFIX)).absolute()
 
 
-def atomic_write(path: Path, write: Callable[[BinaryIO], object], *, follow_link: bool = False) -> None:
+def atomic_write(
+    path: Path, contents: str | bytes | Callable[[BinaryIO], object], *, follow_link: bool = False
+) -> None:
     """Write a file under a temporary name and rename it: a reader sees the old or the new one, never half of one.
 
     Once this has returned, neither a killed process nor a power cut loses the new one.
 
     Args:
         path: Path of the file, in an existing folder.
-        write: Function that writes the contents to the open file.
+        contents: Text, written in UTF-8; bytes; or a function that writes to the open file.
         follow_link: Whether to replace the target of a link at this path, and not the link. Default: False, because an
             untrusted folder may have links to any file of this user.
     """
@@ -85,7 +87,10 @@ def atomic_write(path: Path, write: Callable[[BinaryIO], object], *, follow_link
     try:
         with named_if_full(path):
             with unfinished.open("xb") as file:
-                write(file)
+                if callable(contents):
+                    contents(file)
+                else:
+                    file.write(contents.encode() if isinstance(contents, str) else contents)
                 file.flush()
                 os.fsync(file.fileno())
             if path.exists() and not path.is_symlink():

@@ -148,7 +148,7 @@ class ProcessInfo:
 
     def write(self, file: Path) -> None:
         """Write it to a file."""
-        atomic_write(file, lambda opened: opened.write(json.dumps(asdict(self)).encode()))
+        atomic_write(file, json.dumps(asdict(self)))
 
     @property
     def is_here(self) -> bool:

@@ -138,7 +138,7 @@ def _recorded(folder: Path, recorded: dict[str, dict[str, Any]], files: dict[str
             text = json.dumps(entries if path.name == ENTRIES_ONLY else document, indent=1) + "\n"
         else:
             text = _edited(path.read_text(encoding="utf-8-sig") if found else "", recorded, document)
-        atomic_write(path, lambda file: file.write(text.encode()), follow_link=True)
+        atomic_write(path, text, follow_link=True)
     # ruamel.yaml refuses some odd texts that PyYAML reads, with exceptions of many types.
     except Exception as error:
         raise ManifestError(f"{path}: the manifest cannot be written ({error})") from error

@@ -58,7 +58,7 @@ def write_markup(path: str | Path, volume: LabelVolume, action: ManipulatorActio
         raise MarkupError(f"{path}: a markups file must end in {MARKUP_SUFFIX}, or Slicer does not know it as one")
     document = {"@schema": SCHEMA, "markups": [_markup(volume, action, name)]}
     try:
-        atomic_write(path, lambda file: file.write((json.dumps(document, indent=2) + "\n").encode()))
+        atomic_write(path, json.dumps(document, indent=2) + "\n")
     except OSError as error:
         raise MarkupError(f"{path}: the markups file cannot be written ({error.strerror or error})") from error
 

@@ -18,17 +18,23 @@ def test_file_whose_writer_fails_stays_as_it_was(tmp_path):
         file.write(b"half")
         raise RuntimeError("out of ideas")
 
-    atomic_write(tmp_path / "a", lambda file: file.write(b"whole"))
+    atomic_write(tmp_path / "a", b"whole")
     with pytest.raises(RuntimeError, match="out of ideas"):
         atomic_write(tmp_path / "a", write)
     assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == {"a": b"whole"}
+
+
+@pytest.mark.parametrize("contents", ["ü", "ü".encode(), lambda file: file.write("ü".encode())])
+def test_contents_are_text_bytes_or_a_function_that_writes(tmp_path, contents):
+    atomic_write(tmp_path / "a", contents)
+    assert (tmp_path / "a").read_text(encoding="utf-8") == "ü"
 
 
 def test_file_behind_a_link_is_replaced_with_its_mode_kept(tmp_path):
     (tmp_path / "target").write_bytes(b"old")
     (tmp_path / "target").chmod(0o640)
     (tmp_path / "link").symlink_to(tmp_path / "target")
-    atomic_write(tmp_path / "link", lambda file: file.write(b"new"), follow_link=True)
+    atomic_write(tmp_path / "link", b"new", follow_link=True)
     assert (tmp_path / "link").is_symlink()
     assert (tmp_path / "target").read_bytes() == b"new"
     assert (tmp_path / "target").stat().st_mode & 0o777 == 0o640
@@ -40,7 +46,7 @@ def test_link_is_replaced_and_not_the_file_that_a_stranger_lets_it_lead_to(tmp_p
     for target in ("target", "missing"):
         (tmp_path / "link").unlink(missing_ok=True)
         (tmp_path / "link").symlink_to(tmp_path / target)
-        atomic_write(tmp_path / "link", lambda file: file.write(b"new"))
+        atomic_write(tmp_path / "link", b"new")
         assert not (tmp_path / "link").is_symlink()
     assert sorted(file.name for file in tmp_path.iterdir()) == ["link", "target"]
     assert (tmp_path / "target").read_bytes() == b"old"
@@ -50,13 +56,13 @@ def test_links_that_were_laid_where_a_file_is_made_first_are_not_followed(tmp_pa
     names = (f".a.{os.getpid()}.unfinished", ".a.drawn.unfinished")
     for name in names:
         (tmp_path / name).symlink_to(tmp_path / "precious")
-    atomic_write(tmp_path / "a", lambda file: file.write(b"new"))
+    atomic_write(tmp_path / "a", b"new")
     check_writable(tmp_path / "a")
     monkeypatch.setattr("armscan.utils.files.token_hex", lambda _: "drawn")
     with pytest.raises(FileExistsError):
         check_writable(tmp_path / "a")
     with pytest.raises(FileExistsError):
-        atomic_write(tmp_path / "a", lambda file: file.write(b"newer"))
+        atomic_write(tmp_path / "a", b"newer")
     assert (tmp_path / "a").read_bytes() == b"new"
     assert not (tmp_path / "precious").exists()
 
@@ -104,7 +110,7 @@ def test_folder_is_free_again_when_its_process_was_killed(tmp_path):
     process.kill()
     process.wait()
     with folder_lock(tmp_path):
-        atomic_write(tmp_path / "a", lambda file: file.write(b"x"))
+        atomic_write(tmp_path / "a", b"x")
 
 
 @pytest.mark.parametrize("is_hidden", [False, True], ids=["itself", "behind another"])

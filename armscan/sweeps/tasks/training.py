@@ -191,8 +191,7 @@ def _start_or_resume(
     job = Job(attempt.trial.number, " ".join(attempt.overrides), "", attempt.run_id, attempt.study_folder)
     invocation = Invocation(folder, attempt.overrides, attempt.command, choices, job)
     tracked = start_tracking(config, invocation, setup, tags=attempt.tags, retry_s=RETRY_S)
-    begun = json.dumps({"run_id": tracked.run_id}).encode()
-    atomic_write(folder / RUN_FILE, lambda file: file.write(begun))
+    atomic_write(folder / RUN_FILE, json.dumps({"run_id": tracked.run_id}))
     return setup, tracked, begin_generation(attempt, setup, folder, run_id=tracked.run_id)
 
 

@@ -28,13 +28,11 @@ class Tube:
     nodes: FloatArray
 
     @classmethod
-    def ovoid(
-        cls, label: int, centre: tuple[float, float, float], radii: tuple[float, float, float], bluntness: float = 3.0
-    ) -> Self:
-        """Return an ovoid with `centre` and `radii` (x, y, z) in mm; a larger `bluntness` blunts its ends."""
+    def ovoid(cls, label: int, centre: tuple[float, float, float], radii: tuple[float, float, float]) -> Self:
+        """Return an ovoid with blunt ends, `centre` and `radii` (x, y, z) in mm."""
         x, y, z = centre
         heights = np.sin(np.linspace(-np.pi / 2, np.pi / 2, 17))
-        width = (1 - np.abs(heights) ** bluntness) ** 0.5
+        width = (1 - np.abs(heights) ** 3.0) ** 0.5
         columns = (y + radii[1] * heights, x, z, radii[0] * width, radii[2] * width)
         return cls(label, np.stack(np.broadcast_arrays(*columns), axis=1))
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gzip
 from dataclasses import dataclass, replace
-from operator import methodcaller
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +45,7 @@ def write_rows(file: Path, rows: pd.DataFrame) -> None:
     ordered = rows.sort_values(["config", "seed", "volumes", "env_steps"], ascending=[True, True, False, True])
     text = ordered.to_csv(index=False, float_format="%.7g")
     # The same rows give the same file.
-    atomic_write(file, methodcaller("write", gzip.compress(text.encode(), mtime=0)))
+    atomic_write(file, gzip.compress(text.encode(), mtime=0))
 
 
 def check_rows(rows: pd.DataFrame, design: Design) -> None:
