@@ -16,7 +16,7 @@ from armscan.stats.bootstrap import LEVEL, N_RESAMPLES, Estimate
 from armscan.tracking.sanitize import name_of
 from armscan.training import Evaluation, MetricEstimates, ResultTable
 from armscan.training.baselines import RANDOM
-from armscan.training.headline import beside_random, headline
+from armscan.training.headline import ABOVE_RANDOM, beside_random, headline
 from armscan.training.metric_display import interval_text
 from armscan.training.metrics import LEAST_SURE, NOT_STARTED_SOLVED, SUREST
 from armscan.utils.rate_text import formatted
@@ -102,7 +102,8 @@ class EvaluationReport:
             "intervals": {
                 "level": LEVEL,
                 "resamples": N_RESAMPLES,
-                "method": "percentile bootstrap of volumes, then episodes",
+                "method": "percentile bootstrap of volumes, then episodes; rates of 0 and 1: Wilson; "
+                f"{ABOVE_RANDOM}: Student's t over volumes, or Newcombe",
             },
             "splits": {label: _plain(metrics) for label, metrics in self.by_split.items()},
             "volumes": {
@@ -187,7 +188,9 @@ def _plain(metrics: MetricEstimates) -> dict[str, Any]:
         "episodes": metrics.n_episodes,
         "episodes_started_solved": metrics.n_started_solved,
         "figures": {
-            name: {key: None if math.isnan(number) else number for key, number in estimate._asdict().items()}
-            for name, estimate in metrics.estimates.items()
+            name: {
+                key: None if math.isnan(number) else number for key, number in metrics.estimate(name)._asdict().items()
+            }
+            for name in metrics.estimates
         },
     }

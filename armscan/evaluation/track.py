@@ -15,6 +15,7 @@ from armscan.evaluation.agent_source import TrainedAgent
 from armscan.evaluation.report import EvaluationReport
 from armscan.evaluation.runner import PreparedAgent
 from armscan.evaluation.volumes import check_out, data_name, file_name
+from armscan.experiment.build import on_plane_of
 from armscan.reports.html import page
 from armscan.tracking import TrackedRun, TrackingStore, check_artifacts, open_store, upload_pending
 from armscan.tracking.tags import EVALUATED_TAG
@@ -54,6 +55,7 @@ def evaluate_and_track(
     _check_out(out)
     client, experiment_id = _store_of(source, store)
     upload_pending(client)
+    limits = on_plane_of(source.config)
     of, data = source.run.run_id if source.run else source.name, data_name(applied.data)
     facts = {
         "of": of,
@@ -68,7 +70,7 @@ def evaluate_and_track(
         client,
         experiment_id,
         name=f"evaluation: {source.name} on {data}",
-        config={**to_plain(source.config), "evaluation": facts},
+        config={**to_plain(source.config), "evaluation": {**facts, "on_plane": [list(each) for each in limits]}},
         tags={EVALUATED_TAG: of},
         folder=FOLDER,
         parent_id=source.run.run_id if source.run else None,

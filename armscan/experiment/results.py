@@ -59,12 +59,14 @@ class RunResult:
         baselines: Episodes of the baselines on the test volumes, by their names.
         validation: Validation of the best epoch; None for an agent that does not learn.
         own_baseline: Name of the baseline that equals the agent. Default: None, no baseline does.
+        n_test_subjects: Number of subjects of the test volumes. Default: None, each volume has its own.
     """
 
     evaluations: Mapping[str, Evaluation]
     baselines: Mapping[str, Evaluation]
     validation: Evaluation | None = None
     own_baseline: str | None = None
+    n_test_subjects: int | None = None
 
     @classmethod
     def of(cls, setup: Experiment, result: TrainingResult | None) -> RunResult:
@@ -83,7 +85,7 @@ class RunResult:
         }
         baselines = evaluate_baselines(setup.test_env, n_episodes=n_episodes, seed=TEST_VOLUMES_SEED, on_plane=on_plane)
         own = RANDOM if isinstance(agent, RandomAgent) else None
-        return cls(evaluations, baselines, result.best.evaluation if result else None, own)
+        return cls(evaluations, baselines, result.best.evaluation if result else None, own, setup.split.n_test_subjects)
 
     @cached_property
     def figures(self) -> dict[str, MetricEstimates]:
@@ -123,7 +125,13 @@ class RunResult:
 
     def notes(self) -> list[str]:
         """Return the notes on the volumes; see `volume_notes`."""
-        return volume_notes(self.figures[TEST], self.figures.get(VALIDATION))
+        notes, n_volumes = volume_notes(self.figures[TEST], self.figures.get(VALIDATION)), self.figures[TEST].n_volumes
+        if self.n_test_subjects is not None and self.n_test_subjects < n_volumes:
+            notes.append(
+                f"the {n_volumes} test volumes are of {self.n_test_subjects} subjects: the intervals take each volume "
+                "for another wrist, and are too narrow"
+            )
+        return notes
 
     def write(self, folder: Path, *, title: str) -> None:
         """Write all episodes, and a page with the table, to the folder of the run."""

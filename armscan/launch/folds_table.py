@@ -46,8 +46,16 @@ def folds_table(runs: Iterable[tuple[Path, str]]) -> ResultTable | None:
             # A baseline plays the same episodes for every training seed: they count once.
             training_of = training if name == AGENT else ""
             tested.setdefault(title, {}).setdefault(training_of, {})[fold] = evaluation
+    # Otherwise the volumes of folds that one seed lacks would count less.
+    of_each = [set(folds) for by_training in tested.values() for folds in by_training.values()]
+    common = set.intersection(*of_each) if of_each else set()
+    if not common:
+        return None
     joined = {
-        title: {training: Evaluation.pooled([*each.values()]) for training, each in by_training.items()}
+        title: {
+            training: Evaluation.pooled([evaluation for fold, evaluation in each.items() if fold in common])
+            for training, each in by_training.items()
+        }
         for title, by_training in tested.items()
     }
     figures = {title: MetricEstimates.of_trainings(each) for title, each in joined.items()}

@@ -217,7 +217,10 @@ def _pool_folds(
     if table is None:
         return False
     left_out = len(outcomes) - len(finished)
-    notes = [f"{left_out} of {len(outcomes)} jobs are missing"] if left_out else []
+    missing = (
+        f"{left_out} of {len(outcomes)} jobs are missing: the table is over the folds that all seeds were tested on"
+    )
+    notes = [missing] if left_out else []
     print_table("all folds (test)", table, notes)
     keep_table(table, jobs, folder, store, parent["run_id"], notes)
     return True

@@ -11,7 +11,7 @@ from pathlib import Path
 from armscan.reports.charts import MANY, Curves, colours, final_chart, learning_curves
 from armscan.reports.csv_tables import all_numbers
 from armscan.reports.curves import AXES, curve_of
-from armscan.reports.groups import Group
+from armscan.reports.groups import Group, differing_rules
 from armscan.reports.html import Markup, chart, folded, table, write_page
 from armscan.reports.load import TrackedTraining, validation_titles
 from armscan.reports.notes import notes_on
@@ -23,6 +23,7 @@ from armscan.reports.significance import (
     complement,
     evaluations_by_seed,
     final_metrics,
+    have_same_volumes,
 )
 from armscan.reports.videos import videos
 from armscan.stats.bootstrap import Estimate
@@ -174,7 +175,9 @@ def final_table(groups: Sequence[Group], reached: Sequence[MetricEstimates | Non
     labels = [group.label for group in evaluated]
     baselines = dict(zip(labels, baseline_metrics(evaluated), strict=True))
     randoms = {label: each[RANDOM] for label, each in baselines.items() if RANDOM in each}
-    return ResultTable(with_baselines(figures, baselines), headline=headline(figures, randoms))
+    # The best of several tasks is the easiest.
+    is_one_task = have_same_volumes(evaluated) and not differing_rules(evaluated)
+    return ResultTable(with_baselines(figures, baselines), headline=headline(figures, randoms) if is_one_task else "")
 
 
 def _better(groups: Sequence[Group], pairs: Mapping[str, Sequence[Pair]]) -> Iterator[str]:

@@ -37,7 +37,7 @@ def run_rows(groups: Sequence[Group]) -> list[Row]:
 
 def _run_row(group: Group, training: TrackedTraining) -> Row:
     return {
-        "run": training.id,
+        "run": training.run_id,
         "name": training.name,
         "group": group.name,
         **_seed_and_fold(training),

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from armscan.reports.groups import Group
+from armscan.reports.groups import Group, of_common_folds
 from armscan.reports.load import Series, TrackedTraining
 from armscan.stats.aggregation import Band, band_over_seeds
 from armscan.training.metric_display import bounds_of
@@ -49,7 +49,7 @@ def curve_of(group: Group, figure: str, axis: str) -> Curve | None:
     Values are interpolated linearly between validations. A training that has ended keeps its last value while others of
     its group continue. If one was cut off, the curve ends there. It begins where all have measured a value.
     """
-    trainings = [training for training in group.trainings if figure in training.series]
+    trainings = of_common_folds(training for training in group.trainings if figure in training.series)
     lines = [_line(training.series[figure], axis) for training in trainings]
     known = [(training, line) for training, line in zip(trainings, lines, strict=True) if len(line[0])]
     if not known:

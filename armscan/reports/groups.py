@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -48,6 +48,11 @@ class Group:
         return len({training.fold for training in self.trainings if training.fold is not None})
 
     @property
+    def tested(self) -> list[TrackedTraining]:
+        """Trainings with a final evaluation, of the folds that all seeds were tested on."""
+        return of_common_folds(training for training in self.trainings if training.evaluation is not None)
+
+    @property
     def has_same_volumes(self) -> bool:
         """Whether all of its trainings had the same volumes, or those of their fold, as far as that is known."""
         of_fold = {training.fold: training.volumes for training in self.trainings if training.volumes is not None}
@@ -88,6 +93,15 @@ def _with_same_limits(trainings: Sequence[TrackedTraining]) -> list[TrackedTrain
         )
         for each in trainings
     ]
+
+
+def of_common_folds(trainings: Iterable[TrackedTraining]) -> list[TrackedTraining]:
+    """Return the trainings of the folds that all seeds have: otherwise wrists of the other folds would count less."""
+    trainings, of_seeds = list(trainings), defaultdict(set)
+    for training in trainings:
+        of_seeds[training.seed or training.run_id].add(training.fold)
+    common = set.intersection(*of_seeds.values()) if of_seeds else set()
+    return [training for training in trainings if training.fold in common]
 
 
 def differing_rules(groups: Sequence[Group]) -> list[str]:

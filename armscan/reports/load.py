@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -149,7 +149,9 @@ def read_trainings(store: TrackingStore, runs: Sequence[Run], folder: Path) -> l
         TrackingError: If one of their files is damaged, or the store cannot be used.
     """
     with store_errors(store.uri):
-        histories = metric_histories(store, {run.info.run_id: _wanted(run) for run in runs})
+        leading = {f"{OF_VALIDATION}{leading_of(migrate(run.data.params)).metric}" for run in runs}
+        shown = {WALL, *VALIDATION, *leading}
+        histories = metric_histories(store, {run.info.run_id: _wanted(run, shown) for run in runs})
         files = [_files(store, run, folder / run.info.run_id) for run in runs]
     return [_training(run, histories[run.info.run_id], of_run) for run, of_run in zip(runs, files, strict=True)]
 
@@ -179,9 +181,8 @@ def _training(run: Run, histories: Mapping[str, History], files: Mapping[str, by
     )
 
 
-def _wanted(run: Run) -> list[str]:
-    """Return the names of the metrics of a run that a comparison draws, those of the horizontal axes included."""
-    shown = {WALL, *VALIDATION, f"{OF_VALIDATION}{leading_of(migrate(run.data.params)).metric}"}
+def _wanted(run: Run, shown: Collection[str]) -> list[str]:
+    """Return the names of the metrics of a run that a comparison draws: those to show, and of the training itself."""
     return [name for name in run.data.metrics if name in shown or name.startswith(OF_THE_TRAINING)]
 
 
@@ -218,5 +219,5 @@ def _parsed(run: Run, files: Mapping[str, bytes], name: str, read: Callable[[Any
         raise damaged
     try:
         return read(json.loads(contents))
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise damaged from error

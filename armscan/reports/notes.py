@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 from collections.abc import Iterator, Sequence
 
+from armscan.config.defaults import FOLDS
 from armscan.reports.groups import Group, differing_rules
 from armscan.reports.load import TrackedTraining
 from armscan.reports.significance import evaluations_by_seed
@@ -32,11 +33,20 @@ def notes_on(groups: Sequence[Group], left_out: Sequence[TrackedTraining], *, ha
 
 def _on_folds(groups: Sequence[Group]) -> Iterator[str]:
     for group in groups:
-        if group.n_folds:
+        folds, tested = ({each.fold for each in some} for some in (group.trainings, group.tested))
+        if folds == {None}:
+            continue
+        planned = group.trainings[0].params[FOLDS]
+        n_folds = f"{len(tested)} of {planned}" if planned.isdecimal() else str(len(tested))
+        yield (
+            f"Group {group.number} is a cross-validation: the figures on the test volumes are over {n_folds} folds, "
+            "each volume tested on by trainings that have not seen it, and intervals draw volumes. In learning curves "
+            "each fold of a seed is a line."
+        )
+        if left_out := ", ".join(sorted(str(fold) for fold in folds - tested)):
             yield (
-                f"Group {group.number} is a cross-validation of {group.n_folds} folds: the figures on the test volumes "
-                "are over all of them, each wrist tested on by trainings that have not seen it, and intervals draw "
-                "wrists. In learning curves each fold of a seed is a line."
+                f"Group {group.number}: not all seeds were tested on fold {left_out}, which is left out of the figures "
+                "on the test volumes."
             )
 
 

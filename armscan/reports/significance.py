@@ -43,9 +43,9 @@ class Pair:
 def evaluations_by_seed(group: Group) -> dict[str, Evaluation]:
     """Return the final evaluations of a group by seed; the folds of a seed are pooled, so each wrist counts once."""
     played: dict[str, list[Evaluation]] = defaultdict(list)
-    for training in group.trainings:
-        if training.evaluation is not None:
-            played[training.seed or training.run_id].append(training.evaluation)
+    for training in group.tested:
+        assert training.evaluation is not None
+        played[training.seed or training.run_id].append(training.evaluation)
     return {seed: Evaluation.pooled(evaluations) for seed, evaluations in played.items()}
 
 
@@ -74,6 +74,12 @@ def compare_groups(groups: Sequence[Group]) -> dict[str, list[Pair]]:
     return compared
 
 
+def have_same_volumes(groups: Sequence[Group]) -> bool:
+    """Return whether all groups were evaluated on the same volumes."""
+    first, *others = map(_volumes, groups)
+    return all(_are_same(first, each) for each in others)
+
+
 def complement(probability: Estimate) -> Estimate:
     """Return the probability that the second group is better than the first."""
     return Estimate(1.0 - probability.value, 1.0 - probability.high, 1.0 - probability.low)
@@ -98,7 +104,7 @@ def baseline_metrics(groups: Sequence[Group]) -> list[dict[str, MetricEstimates]
 
 def _baselines(group: Group) -> dict[str, list[Evaluation]]:
     """Return the baselines' evaluations by name, one for each fold."""
-    of_fold = {each.fold: each.baselines for each in reversed(group.trainings) if each.baselines}
+    of_fold = {each.fold: each.baselines for each in reversed(group.tested) if each.baselines}
     names = dict.fromkeys(name for baselines in of_fold.values() for name in baselines)
     return {name: [each[name] for each in of_fold.values() if name in each] for name in names}
 
@@ -117,11 +123,11 @@ def _compared(evaluation: Evaluation) -> dict[str, dict[str, float]]:
 def _volumes(group: Group) -> Mapping[str, str | None] | None:
     """Return the volumes that a group was evaluated on, with fingerprints; None if its seeds differ."""
     of_seeds: dict[str, dict[str, str | None]] = defaultdict(dict)
-    for training in group.trainings:
-        if training.evaluation is not None:
-            known = (training.volumes or {}).get("test", {})
-            prints = {name: known.get(name) for name in training.evaluation.by_volume()}
-            of_seeds[training.seed or training.run_id] |= prints
+    for training in group.tested:
+        assert training.evaluation is not None
+        known = (training.volumes or {}).get("test", {})
+        prints = {name: known.get(name) for name in training.evaluation.by_volume()}
+        of_seeds[training.seed or training.run_id] |= prints
     first, *others = of_seeds.values() or [None]
     return first if all(_are_same(first, each) for each in others) else None
 

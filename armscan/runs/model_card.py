@@ -107,6 +107,7 @@ def _read(run: FoundRun, run_id: str, file: str, folder: Path) -> EvaluationRepo
             evaluations = _evaluations(contents["episodes"], limits)
             kept = contents.get("baselines", {})
             baselines = {name: _evaluations(each["episodes"], limits) for name, each in kept.items()}
+        has_total = TOTAL in contents.get("splits", ())
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise _damaged(run_id, file) from error
     kinds = {"data": str, "changes": dict, "notes": list}
@@ -114,7 +115,6 @@ def _read(run: FoundRun, run_id: str, file: str, folder: Path) -> EvaluationRepo
     played = [*evaluations.values(), *(each for by_label in baselines.values() for each in by_label.values())]
     if not (is_read and evaluations and all(evaluation.episodes for evaluation in played)):
         raise _damaged(run_id, file)
-    has_total = TOTAL in contents.get("splits", ())
     return EvaluationReport(evaluations, has_total=has_total, facts=facts, baselines=baselines)
 
 
@@ -130,7 +130,7 @@ def _json(run: FoundRun, run_id: str, file: str, folder: Path) -> Any:
     text = Path(run.client.download_artifacts(run_id, file, str(folder))).read_bytes()
     try:
         return json.loads(text)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise _damaged(run_id, file) from error
 
 

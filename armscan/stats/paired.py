@@ -77,8 +77,8 @@ def crossed_mean(values: FloatArray) -> tuple[Any, Any]:
     differ = volumes > rest if n_seeds > 1 else np.full(means.shape, True)
     variances = np.maximum(seeds + np.where(differ, volumes - rest, 0.0), volumes)
     terms = seeds**2 / max(1, n_seeds - 1) + np.where(differ, volumes**2 / max(1, n_volumes - 1), 0.0)
-    # Without any spread the width is 0 for any number of degrees of freedom.
-    df = np.where(terms > 0.0, variances**2 / np.where(terms > 0.0, terms, 1.0), 1.0)
+    # Without any of these spreads, their degrees of freedom limit nothing.
+    df = np.where(terms > 0.0, variances**2 / np.where(terms > 0.0, terms, 1.0), np.inf)
     halves = stdtrit(df, (1 + LEVEL) / 2) * np.sqrt(variances)
     for mean_square, n in ((seeds, n_seeds), (volumes, n_volumes)):
         if n > 1:

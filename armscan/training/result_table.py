@@ -188,7 +188,10 @@ def _cell(result: MetricEstimates, column: Quantity, around: str = "{}") -> tupl
 
 
 def _count(result: MetricEstimates, name: str) -> str:
-    return str(getattr(result, name)) if result.n_episodes else MISSING
+    count = getattr(result, name)
+    # Metrics of a validation do not have the number of its volumes.
+    is_known = result.n_episodes and (count or name != "n_volumes")
+    return str(count) if is_known else MISSING
 
 
 def _html_cell(result: MetricEstimates, column: Quantity) -> str:

@@ -47,3 +47,4 @@ def test_metrics_have_the_intervals_that_the_table_shows():
     shown = report.by_split["volumes"].estimate("success_rate")
     assert shown.low < shown.value == 1.0
     assert report.metrics()["volumes"]["success_rate_low"] == shown.low
+    assert report.to_dict()["splits"]["volumes"]["figures"]["success_rate"] == shown._asdict()

@@ -37,6 +37,8 @@ def test_evaluate_gives_figures_with_intervals_as_table_json_and_metrics(evaluat
             assert child.data.metrics[f"{group}/{figure}"] == pytest.approx(numbers["value"])
             assert child.data.metrics[f"{group}/{figure}_low"] == pytest.approx(numbers["low"])
     assert child.data.params["env.max_steps"] == "3"
+    # By which `armscan runs list` knows the leading rate.
+    assert child.data.params["evaluation.on_plane"].startswith("[[5.0, 10.0]")
     assert {file.path[-5:] for file in client.list_artifacts(child.info.run_id)} == {".json", ".html"}
     assert 0.0 <= child.data.metrics["random/test_volumes/on_plane_5mm_10deg"] <= 1.0
     # The run itself stays as it was, and an evaluation is nothing to evaluate.

@@ -18,6 +18,15 @@ def test_agent_that_is_a_baseline_has_one_row():
     assert list(beside.table().results) == ["agent, test", "random, test", "agent, training"]
 
 
+@pytest.mark.parametrize("n_subjects", [None, 7, 8])
+def test_volumes_of_the_same_subject_are_said(n_subjects):
+    played = {name: Evaluation(made_episodes(0, n_volumes=8)) for name in (TRAINING, TEST)}
+    notes = RunResult(played, {}, n_test_subjects=n_subjects).notes()
+    assert [note.partition(":")[0] for note in notes] == (
+        ["the 8 test volumes are of 7 subjects"] if n_subjects == 7 else []
+    )
+
+
 @pytest.mark.parametrize(
     ("n_test", "n_validation", "few"),
     [(8, 8, None), (8, None, None), (8, 4, "4 validation volumes"), (1, 4, "1 test volume and 4 validation volumes")],

@@ -122,13 +122,15 @@ def test_table_puts_the_wrists_of_all_folds_together(tmp_path):
     assert found.estimate("median_distance_mm") == pytest.approx(expected)
 
 
-def test_random_planes_count_once_where_a_run_of_the_first_seed_is_missing(tmp_path):
+def test_folds_that_a_seed_lacks_are_left_out_of_the_table(tmp_path):
     runs = [
         (left_by_a_run(tmp_path / f"{fold}-{seed}", f"wrist{fold}", [1.0]), f"data.fold={fold} seed={seed}")
         for fold, seed in ((0, 0), (0, 1), (1, 1))
     ]
-    random = folds_table(runs).results["random, all folds"]
-    assert (random.n_volumes, random.n_episodes) == (2, 2)
+    results = folds_table(runs).results
+    assert (results[AGENT].n_seeds, results[AGENT].n_volumes) == (2, 1)
+    assert (results["random, all folds"].n_volumes, results["random, all folds"].n_episodes) == (1, 1)
+    assert folds_table([runs[0], runs[2]]) is None
 
 
 def test_every_wrist_counts_alike_however_many_a_fold_has(tmp_path):

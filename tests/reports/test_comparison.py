@@ -150,8 +150,24 @@ def test_folds_of_a_grid_are_one_configuration_with_intervals_by_wrist(written, 
     # Both seeds are alike: the interval is of wrists.
     assert figures.estimates["mean_steps"] == (5.0, 2.0, 9.0)
     page, _ = written(*trainings)
-    assert "cross-validation of 3 folds" in page
+    assert "is a cross-validation: the figures on the test volumes are over 3 folds, each" in page
     assert "differ by nothing but the seed and the fold" in page
+    page, _ = written(*trainings[:-1])
+    assert "the figures on the test volumes are over 2 folds" in page
+    assert "not all seeds were tested on fold 2, which is left out of the figures on the test volumes" in page
+    (group,), _ = group_trainings(trainings[:-1])
+    assert final_metrics(group).estimates["mean_steps"].value == 3.0
+
+
+def test_headline_names_no_best_of_groups_with_other_volumes_or_rules(written, make_training):
+    rates = {"a": make_training(0, params={"agent.lr": "0.1"}), "b": make_training(0, params={"agent.lr": "0.2"})}
+    page, _ = written(*rates.values())
+    assert "best of 2, chosen on these volumes" in page
+    page, _ = written(rates["a"], make_training(0, params={"env.max_steps": "9"}))
+    assert "chosen on these volumes" not in page
+    other = {"test": {"v1": "another"}}
+    page, _ = written(rates["a"], make_training(0, params={"agent.lr": "0.2"}, volumes=other))
+    assert "chosen on these volumes" not in page
 
 
 @pytest.mark.parametrize("part", ["training", "test"])

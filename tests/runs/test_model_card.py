@@ -85,7 +85,14 @@ def test_damaged_evaluation_of_a_run_is_one_line(keep, tmp_path, contents):
 
 @pytest.mark.parametrize(
     "contents",
-    [{}, [], BY_COMMAND | {"changes": []}, BY_COMMAND | {"data": 1}, BY_COMMAND | {"episodes": {"test volumes": []}}],
+    [
+        {},
+        [],
+        BY_COMMAND | {"splits": 5},
+        BY_COMMAND | {"changes": []},
+        BY_COMMAND | {"data": 1},
+        BY_COMMAND | {"episodes": {"test volumes": []}},
+    ],
 )
 def test_damaged_evaluation_by_the_command_is_one_line(keep, tmp_path, contents):
     run_id = keep("evaluation.json", json.dumps(OWN))

@@ -50,6 +50,14 @@ def test_difference_of_equal_trainings_has_no_width_and_that_of_one_seed_no_inte
         assert np.isnan([low, high]).all()
 
 
+def test_interval_of_seeds_with_equal_means_is_hardly_wider_than_of_nearly_equal_ones():
+    scores = np.tile(np.array([0.1, 0.2, 0.3, 0.4, 0.2, 0.3, 0.2, 0.3]), (2, 1))
+    scores[1, :2] = scores[1, 1::-1]
+    nearly = scores + np.array([[0.0], [1e-6]])
+    halves = [crossed_mean(each)[1] for each in (scores, nearly)]
+    assert halves[0] == pytest.approx(halves[1], rel=0.01)
+
+
 def test_trainings_of_other_seeds_or_volumes_are_refused():
     with pytest.raises(InvalidValueError, match=r"the shapes \(2, 3\) and \(3, 3\)"):
         paired_difference(np.zeros((2, 3)), np.zeros((3, 3)))

@@ -108,6 +108,12 @@ def test_figures_that_were_tracked_are_read_again():
     assert (again.n_volumes, again.n_episodes, again.on_plane) == (4, 24, (OnPlane(5, 10), OnPlane(2, 5)))
 
 
+def test_number_of_volumes_that_was_not_tracked_is_not_shown():
+    figures = MetricEstimates.of_metrics({"success_rate": 0.5, "episodes": 4})
+    (row,) = [line for line in ResultTable({"agent": figures}).markdown().splitlines() if "volumes" in line]
+    assert "0" not in row
+
+
 def test_figures_of_older_runs_are_shown_without_intervals():
     old = {"success_rate": 0.5, "mean_steps": 9.25, "mean_distance_mm": 3.0, "mean_dice": 0.4}
     table = ResultTable({"agent": MetricEstimates.of_metrics(old)})
