@@ -27,11 +27,11 @@ from armscan.config.defaults import MULTIRUN, PLAN, RESUME
 from armscan.config.error_messages import TRACEBACKS, print_mistake
 from armscan.config.sources import SWEEP
 from armscan.errors import is_interruption
-from armscan.experiment.job import INTERRUPTED, Invocation, remove_if_untracked
+from armscan.experiment.job import INTERRUPTED, Invocation, check_folder_stays, remove_if_untracked
 from armscan.launch.folds_grid import with_folds
 from armscan.launch.grid_plan import check_grid, print_grid_plan
 from armscan.launch.job_process import start_job
-from armscan.launch.multirun import Multirun, end_multirun
+from armscan.launch.multirun import Multirun, end_multirun, print_resume_command
 from armscan.utils.log import silence_libraries
 
 
@@ -94,6 +94,16 @@ def repeat_grid(words: Sequence[str], run_id: str, *, trust: bool) -> None:
     launch([MULTIRUN[0], *words])
 
 
+def _end_interrupted() -> None:
+    """Close a multirun that was interrupted; a second interrupt leaves that to `armscan runs sync`."""
+    try:
+        end_multirun(is_interrupted=True)
+    except (KeyboardInterrupt, Exception) as error:
+        if not is_interruption(error):
+            raise
+        print_resume_command()
+
+
 def main() -> int:
     """Run the command line; return the exit code."""
     if os.environ.get("HYDRA_FULL_ERROR") == "1":
@@ -107,6 +117,7 @@ def main() -> int:
     sys.argv[1:] = sorted(sys.argv[1:], key=lambda word: word not in MULTIRUN)
     try:
         check_words(sys.argv[1:])
+        check_folder_stays(sys.argv[1:])
         if any(word.startswith(f"{SWEEP}=") for word in sys.argv[1:]):
             if PLAN not in sys.argv[1:]:
                 print("preparing a study: its space is checked first", flush=True)
@@ -136,7 +147,7 @@ def main() -> int:
     except (KeyboardInterrupt, Exception) as error:
         # An interrupt inside compiled code can surface as any other error.
         if is_interruption(error):
-            end_multirun(is_interrupted=True)
+            _end_interrupted()
             print(INTERRUPTED, file=sys.stderr)
             return 130
         end_multirun()

@@ -298,6 +298,8 @@ def test_run_on_labelmap_files(tmp_path, data_folder):
         (["data=nifti", "data.path=null"], "data.path is None, but it must be the path of a file or folder"),
         (["device=tpu"], "device is 'tpu', but it must be auto, cpu or cuda"),
         (["tracking.uri=./mlruns"], "tracking.uri is './mlruns', but this store cannot be used"),
+        (["hydra.job.chdir=true"], "hydra.job.chdir is 'true', but it must be false: relative paths"),
+        (["-m", "seed=1,2", "hydra.job.chdir=true"], "hydra.job.chdir is 'true', but it must be false: relative paths"),
         (["-m", "obs=cluster,foo"], "obs is 'foo', but it must be action_reward, cluster"),
         (["obs=cluster", "-m", "agent=foo"], "agent is 'foo', but it must be "),
         (["-m", "seed=1,2", "tracking=null"], "Config group override must be a string or a list. Got NoneType"),

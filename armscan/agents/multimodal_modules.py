@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from itertools import chain, pairwise
 from typing import Any
@@ -63,7 +64,10 @@ class MultimodalBody(ModuleWithVectorOutput):
         for name, convolutions in self.convolutions.items():
             image = torch.as_tensor(obs[name], device=device)
             # Stacked frames, and their channels for the tissues, all become channels.
-            frames = image.reshape(image.shape[0], -1, *image.shape[-2:]).float() * self._scales[name]
+            frames = (
+                image.reshape(image.shape[0], math.prod(image.shape[1:-2]), *image.shape[-2:]).float()
+                * self._scales[name]
+            )
             features.append(convolutions(frames))
         return self.head(torch.cat(features, dim=1)), state
 

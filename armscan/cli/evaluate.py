@@ -32,6 +32,7 @@ OPTIONS = {
     "tracking.uri": "--tracking URI",
     "tracking.experiment": "--tracking-experiment NAME",
     "evaluation.episodes": "--episodes NUMBER",
+    "seed": "--seed NUMBER",
 }
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from armscan.cli.options import FILE_PATH, examples, tracking_option, trust_option
+from armscan.config.command_hints import typed
 from armscan.errors import InvalidValueError
 
 
@@ -67,4 +68,5 @@ def register(run: str, name: str, tracking: str, trust: bool) -> None:
 
 def _print_usage(address: str) -> None:
     print(f"load it    mlflow.pyfunc.load_model({address!r}).predict(observations)")
-    print(f"serve it   mlflow models serve -m {shlex.quote(address)} --env-manager local")
+    serve = shlex.join([*typed("mlflow"), "models", "serve", "-m", address, "--env-manager", "local"])
+    print(f"serve it   {serve}")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from omegaconf import OmegaConf
 
-from armscan.config.sources import CONF, SWEEP, SWEEPS, config_folder, own_folders, sweeps_folder
+from armscan.config.sources import CONF, SWEEP, SWEEPS, config_folder, own_folders, sweeps_folder, yaml_files
 
 # Groups that other configurations choose from, not users.
 HIDDEN = ("hydra/help", "study")
@@ -20,7 +20,7 @@ def choices() -> dict[str, dict[str, Path]]:
     roots = [(config_folder(), ""), (own.get(CONF), ""), (sweeps_folder(), SWEEP), (own.get(SWEEPS), SWEEP)]
     found: dict[str, dict[str, Path]] = {}
     for root, prefix in roots:
-        for path in sorted(root.rglob("*.yaml")) if root is not None else ():
+        for path in yaml_files(root) if root is not None else ():
             group = Path(prefix, path.parent.relative_to(root)).as_posix() if root is not None else ""
             found.setdefault(group, {})[path.stem] = path
     return dict(sorted(found.items()))

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import functools
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
 import hydra
 from hydra._internal.core_plugins.file_config_source import FileConfigSource
+from hydra.core.config_loader import ConfigLoader
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.object_type import ObjectType
@@ -111,10 +113,17 @@ def compose(overrides: Sequence[str] = (), *, return_hydra_config: bool = False)
         overrides: Overrides in the syntax of the command line, such as `["agent=ppo", "seed=1"]`.
         return_hydra_config: Whether to keep the section `hydra`. Default: False.
     """
+    with config_loader():
+        return hydra.compose(CONFIG_NAME, list(overrides), return_hydra_config=return_hydra_config)
+
+
+@contextmanager
+def config_loader() -> Iterator[ConfigLoader]:
+    """Yield a loader of armscan's configuration and the user's own, which Hydra uses meanwhile."""
     register()
     GlobalHydra.instance().clear()
     with hydra.initialize_config_dir(str(config_folder()), version_base=VERSION_BASE):
-        return hydra.compose(CONFIG_NAME, list(overrides), return_hydra_config=return_hydra_config)
+        yield GlobalHydra.instance().config_loader()
 
 
 def compose_run(words: Sequence[str]) -> tuple[DictConfig, dict[str, str]]:

@@ -7,7 +7,8 @@ from typing import Any, cast
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from armscan.config.services import STORAGE, address_of
-from armscan.config.sources import config_file
+from armscan.config.sources import config_file, config_folder
+from armscan.errors import InvalidValueError
 
 # The rules that options of `armscan evaluate` change, and their keys in the configuration.
 CHANGES = {
@@ -33,6 +34,7 @@ ADDED = ("training.schedule",)
 FOLDS, FOLD = "data.folds", "data.fold"
 # Prefixes of keys that a study does not search.
 NOT_SEARCHED = ("study", "sweep", "tracking", "hydra", "seed")
+TRACKING_FILE = "tracking/mlflow.yaml"
 # Stands for phantoms where a command takes a folder of volumes.
 PHANTOM = "phantom"
 
@@ -43,8 +45,16 @@ def to_plain(config: DictConfig | ListConfig) -> dict[str, Any]:
 
 
 def default_tracking() -> dict[str, Any]:
-    """Return the default section `tracking`."""
-    return to_plain(OmegaConf.load(config_file("tracking/mlflow.yaml")))
+    """Return the default section `tracking`.
+
+    Raises:
+        InvalidValueError: If the user's own file of it names no store.
+    """
+    file, ours = config_file(TRACKING_FILE), config_folder() / TRACKING_FILE
+    section = OmegaConf.load(file)
+    if "uri" not in section:
+        raise InvalidValueError(f"{file} has no key 'uri', but it replaces {ours}: begin with a copy of that file")
+    return to_plain(section)
 
 
 def default_storage() -> str:

@@ -47,6 +47,11 @@ def own_folders() -> dict[str, Path]:
     return {} if is_checkout else folders
 
 
+def yaml_files(folder: Path) -> list[Path]:
+    """Return the YAML files of a folder, recursively, without the hidden ones that editors and systems leave."""
+    return sorted(path for path in folder.rglob("*.yaml") if not path.name.startswith(".") and path.is_file())
+
+
 def config_file(name: str) -> Path:
     """Return the file of a configuration by its path in `conf`, such as `tracking/mlflow.yaml`."""
     own = own_folders().get(CONF)
@@ -58,7 +63,7 @@ def replaced_files() -> list[Path]:
     replaced = []
     for name, folder in own_folders().items():
         ours = sweeps_folder() if name == SWEEPS else config_folder()
-        for path in sorted(folder.rglob("*.yaml")):
+        for path in yaml_files(folder):
             other = ours / path.relative_to(folder)
             if other.is_file() and other.read_bytes() != path.read_bytes():
                 replaced.append(Path(name, path.relative_to(folder)))

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from armscan.config.legacy import migrate
-from armscan.config.sources import config_folder, own_folders, sweeps_folder
+from armscan.config.sources import SWEEP, config_folder, own_folders, sweeps_folder, yaml_files
 from armscan.errors import UntrustedError
 from armscan.utils.files import SQLITE_PREFIX
 
@@ -34,8 +34,8 @@ PACKAGES_OF_COMMANDS = ("armscan.launch.", "armscan.sweeps.")
 def offered_classes() -> frozenset[str]:
     """Return the names of the classes and functions that armscan's own configuration builds runs from."""
     root = config_folder()
-    files = [path for path in root.rglob("*.yaml") if path.relative_to(root).parts[0] not in GROUPS_OF_COMMANDS]
-    names = _classes_in([*files, *sweeps_folder().glob("*.yaml")])
+    files = [path for path in yaml_files(root) if path.relative_to(root).parts[0] not in GROUPS_OF_COMMANDS]
+    names = _classes_in([*files, *yaml_files(sweeps_folder())])
     return frozenset(name for name in names if not name.startswith(PACKAGES_OF_COMMANDS))
 
 
@@ -69,7 +69,7 @@ def check_composed(config: Mapping[str, Any], *, where: str) -> None:
         config: Resolved configuration.
         where: Owner of the configuration, such as `job 3`, for the error.
     """
-    own = _classes_in(file for folder in own_folders().values() for file in folder.rglob("*.yaml"))
+    own = _classes_in(file for folder in own_folders().values() for file in yaml_files(folder))
     if found := _foreign_part(config, offered_classes() | own):
         raise UntrustedError(f"{where}: its configuration {found}; {HOW}")
 
@@ -110,7 +110,7 @@ def untrusted_word(words: Sequence[str], uri: str) -> str | None:
         value = value.strip("'\"")
         # A server is sent this user's password.
         is_elsewhere = value != uri and SERVER.search(value) is not None
-        is_changing_hydra = "hydra" in key or key.startswith("-")
+        is_changing_hydra = "hydra" in key or key.startswith("-") or key.partition("@")[0] == SWEEP
         # A key with dots is a value, which may be any path, and never a group.
         is_outside = "." not in key.partition("@")[0] and OUTSIDE.search(value) is not None
         if is_elsewhere or is_changing_hydra or is_outside or TARGET in plain or INTERPOLATION in plain:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.text import Text
 
-from armscan.config.command_hints import armscan_command
+from armscan.config.command_hints import STARTED_IN, armscan_command
 from armscan.config.defaults import FOLD
 from armscan.experiment.job import INTERRUPTED, JobOutcome
 from armscan.experiment.results import TITLES, RunResult
@@ -105,6 +105,9 @@ def print_where_to_look(
 
 
 def from_here(path: Path) -> Path:
-    """Return a path as one would type it in the current folder."""
+    """Return a path as one would type it in the folder that the command was started in."""
     here = Path.cwd()
-    return path.relative_to(here) if path.is_relative_to(here) else path
+    if not path.is_relative_to(here):
+        return path
+    # A resumed run has changed to another folder.
+    return path.relative_to(here) if here == STARTED_IN else path.absolute()

@@ -9,6 +9,7 @@ import contextlib
 import json
 import shlex
 import shutil
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Self
@@ -17,8 +18,8 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 
 from armscan.config.command_hints import kept_command
-from armscan.errors import FolderInUseError, FolderTakenError
-from armscan.utils.files import CONFIG_FILE, LOCK_FILE, OUTBOX_FOLDER, OUTBOX_SUFFIXES, RUN_ID, atomic_write
+from armscan.errors import FolderInUseError, FolderTakenError, InvalidValueError
+from armscan.utils.files import CONFIG_FILE, LOCK_FILE, OUTBOX_FOLDER, OUTBOX_SUFFIXES, RUN_ID, atomic_write, sha256
 
 PARENT_FILE = "parent_run.json"
 OUTCOME_FOLDER = "outcomes"
@@ -83,6 +84,14 @@ class Job:
         """The prefix of the lines that the job prints."""
         return f"{self.number} {self.varied}".strip()
 
+    def claims(self, folder: Path) -> bool:
+        """Return whether this job is the first of its multirun to use a folder, and keep that for the others."""
+        file = self.folder / OUTCOME_FOLDER / f"{sha256(str(folder).encode())}.folder"
+        with contextlib.suppress(FileExistsError), file.open("x") as opened:
+            opened.write(str(self.number))
+        # The same job may be started again, as after a requeue.
+        return file.read_text() == str(self.number)
+
     def write_outcome(self, *, failure: str | None = None, metrics: dict[str, dict[str, float]] | None = None) -> None:
         """Write the outcome for the process that launched the job."""
         outcome = JobOutcome(self.overrides, self.varied, failure, metrics or {})
@@ -119,6 +128,16 @@ class Invocation:
             choices={str(group): str(choice) for group, choice in hydra_config.runtime.choices.items()},
             job=Job.current(),
         )
+
+
+def check_folder_stays(words: Sequence[str]) -> None:
+    """Raise `InvalidValueError` if a command line asks Hydra to change to the folder of each run."""
+    for word in words:
+        key, _, value = word.lstrip("+").partition("=")
+        if key == "hydra.job.chdir" and value.lower() != "false":
+            raise InvalidValueError(
+                f"{key} is {value!r}, but it must be false: relative paths, the store's too, begin where it was started"
+            )
 
 
 def remove_if_untracked(folder: Path, error: BaseException) -> None:

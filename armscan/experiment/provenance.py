@@ -68,7 +68,7 @@ def start_tracking(
     resolved = to_plain(config)
     client, experiment_id = open_store(**resolved["tracking"], retry_s=retry_s)
     upload_pending(client)
-    choices, job = invocation.choices, invocation.job
+    choices, job = _with_own_observation(invocation.choices, resolved), invocation.job
     files = provenance_files(resolved, setup)
     _remove_earlier(invocation.folder)
     # Before the run exists, so that it can be resumed whenever it is killed.
@@ -141,9 +141,22 @@ def place_tags(folder: Path) -> dict[str, str]:
     return {FOLDER_TAG: str(folder.resolve()), HOST_TAG: socket.gethostname(), VERSION_TAG: armscan.__version__}
 
 
+def _with_own_observation(choices: Mapping[str, str], config: Mapping[str, Any]) -> dict[str, str]:
+    """Return the choices of a run, with the observation that `env.observation` names in place of `obs`."""
+    observation = config["env"]["observation"]
+    if observation == config["obs"]:
+        return dict(choices)
+    names = [
+        str(each.get("_target_", each)).rpartition(".")[2] if isinstance(each, Mapping) else str(each)
+        for each in (observation if isinstance(observation, list) else [observation])
+    ]
+    return {**choices, "obs": "+".join(names)}
+
+
 def run_name(config: dict[str, Any], choices: dict[str, str]) -> str:
     """Return the name of a run in the UI: the choices by which most runs differ."""
-    projection = config["projection"]
+    rules = config["env"]
+    projection = rules["projection"]
     parts = [choices["agent"], choices["obs"], projection if isinstance(projection, str) else "+".join(projection)]
-    parts += [f"{name}{config[name]}" for name, without in (("stack", 1), ("memory", 0)) if config[name] != without]
+    parts += [f"{name}{rules[name]}" for name, without in (("stack", 1), ("memory", 0)) if rules[name] != without]
     return "-".join([*parts, choices["data"], f"seed{config['seed']}"])

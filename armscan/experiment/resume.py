@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import yaml
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 from pydantic import TypeAdapter, ValidationError
 
@@ -31,10 +32,12 @@ from armscan.utils.files import (
     OUTBOX_FOLDER,
     OUTBOX_SUFFIXES,
     SHA256_TAGS,
+    SQLITE_PREFIX,
     VOLUMES_FILE,
     folder_lock,
     remove_unfinished,
     sha256,
+    sqlite_file,
 )
 from armscan.utils.strict_yaml import load_yaml
 
@@ -67,7 +70,23 @@ def resume(words: Sequence[str], repeat_grid: Callable[..., None]) -> None:
     if not trust:
         _check_grid(run, grid, uri)
     _enter_working_folder(run)
+    _check_store(run, grid, client.uri)
     repeat_grid(grid, run.info.run_id, trust=trust)
+
+
+def _check_store(run: Run, words: Sequence[str], uri: str) -> None:
+    """Raise `ResumeError` if the jobs of a grid would be tracked in another store than the one that it was read from.
+
+    To be called in the grid's working folder, where a relative address of its store begins.
+    """
+    given = [each for each in OverridesParser.create().parse_overrides([*words]) if each.key_or_group == TRACKING_URI]
+    stored = str(given[-1].value()) if given else uri
+    places = [Path(sqlite_file(each)).resolve() if each.startswith(SQLITE_PREFIX) else each for each in (stored, uri)]
+    if places[0] != places[1]:
+        raise ResumeError(
+            f"run {run.info.run_id} was tracked in {stored}, where its jobs would be tracked again, and not in {uri}: "
+            "put the store back under its old address, or start the grid again"
+        )
 
 
 def _grid_of(run: Run) -> list[str]:

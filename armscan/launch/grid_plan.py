@@ -10,7 +10,7 @@ from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
-from armscan.config.compose import compose
+from armscan.config.compose import compose, config_loader
 from armscan.config.defaults import MULTIRUN, PLAN
 from armscan.config.sources import SWEEP
 from armscan.errors import ArmscanError, InvalidValueError
@@ -73,6 +73,8 @@ def check_grid(words: Sequence[str]) -> None:
 
 def _jobs_of(overrides: Sequence[str]) -> tuple[list[Override], list[list[str]]]:
     """Return the overrides of a grid, parsed, and those of each job."""
-    parsed = OverridesParser.create().parse_overrides(list(overrides))
-    (jobs,) = BasicSweeper.split_arguments(parsed, max_batch_size=None)
+    # Of `glob(...)`, the loader tells which choices there are.
+    with config_loader() as loader:
+        parsed = OverridesParser.create(config_loader=loader).parse_overrides(list(overrides))
+        (jobs,) = BasicSweeper.split_arguments(parsed, max_batch_size=None)
     return parsed, jobs

@@ -25,6 +25,11 @@ def start_job(config: DictConfig, invocation: Invocation, job: Job) -> None:
 
     If it is killed, for example out of memory, the launcher and the other jobs continue.
     """
+    if not job.claims(invocation.folder):
+        failure = f"its folder, {invocation.folder}, is another job's: hydra.sweep.subdir must differ between jobs"
+        job.write_outcome(failure=failure)
+        print(f"[{job.label}] failed: {failure}", file=sys.stderr, flush=True)
+        return
     job.write_outcome(failure=NO_OUTCOME)
     command = child_command(__name__, run_job.__name__)
     ended = subprocess.run(command, input=pickle.dumps((config, invocation)), check=False)

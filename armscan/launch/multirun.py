@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
@@ -21,7 +22,14 @@ from armscan.config.defaults import TRACKING_URI, to_plain
 from armscan.config.error_messages import one_line_message
 from armscan.config.trust import needs_trust, untrusted_word
 from armscan.errors import InvalidValueError, TrackingError
-from armscan.experiment.job import INTERRUPTED, NO_OUTCOME, OUTCOME_FOLDER, PARENT_FILE, JobOutcome, remove_run_folder
+from armscan.experiment.job import (
+    INTERRUPTED,
+    NO_OUTCOME,
+    OUTCOME_FOLDER,
+    PARENT_FILE,
+    JobOutcome,
+    remove_run_folder,
+)
 from armscan.launch.launchers import LAUNCHER, check_launcher
 from armscan.tracking.tags import FAILURE_TAG, FOLDER_TAG, GRID_TAG, JOB_TAG
 from armscan.utils.files import LAST_CHECKPOINT, RESULTS_PAGE, atomic_write
@@ -80,7 +88,11 @@ class Multirun(Callback):
         command = " ".join(overrides)
         # Includes the tracking URI, because the environment may differ later.
         hydra_words = [word for word in config.hydra.overrides.hydra if not word.startswith(NOT_REPEATED)]
-        again = [*overrides, *hydra_words, f"{TRACKING_URI}='{tracking['uri']}'"]
+        again = [
+            *overrides,
+            *hydra_words,
+            f"{TRACKING_URI}={QuotedString(tracking['uri'], Quote.single).with_quotes()}",
+        ]
         tags = {**source().tags, "overrides": command, "working_folder": str(Path.cwd()), GRID_TAG: json.dumps(again)}
         run = client.create_run(experiment_id, name=f"multirun {command}"[:250], tags=tags)
         parent = {"run_id": run.info.run_id, "tracking": tracking, "overrides": overrides, "common": _common(overrides)}
@@ -150,6 +162,14 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
     if store is not None and not runs:
         remove_run_folder(folder)
     return 1 if failed or not outcomes else 0
+
+
+def print_resume_command() -> None:
+    """Print the command that resumes a multirun that could not be closed."""
+    if Multirun.folder is not None:
+        parent = json.loads((Multirun.folder / PARENT_FILE).read_text())
+        again = resume_command(parent["run_id"], parent["tracking"]["uri"], trust=parent["trust"])
+        print(f"the grid was not closed; resume it with: {again}", file=sys.stderr)
 
 
 def _read_outcomes(folder: Path) -> dict[str, JobOutcome]:

@@ -104,10 +104,7 @@ def facts_of(config: Mapping[str, Any], env: Env, run_id: str) -> dict[str, Any]
     return {
         "armscan": armscan.__version__,
         "run": run_id,
-        "projection": config["projection"],
-        "observation": config["obs"],
-        "stack": config["stack"],
-        "memory": config["memory"],
+        **{name: rules[name] for name in ("projection", "observation", "stack", "memory")},
         "action": {name: means[name] for name in env.get_wrapper_attr("action_names")},
     }
 

@@ -64,12 +64,17 @@ def find(
     projections = _projection_params(projection) if projection else None
 
     def is_fit(run: Run) -> bool:
-        tags, given = run.data.tags, run.data.params.get("projection")
+        tags, given = run.data.tags, projection_of(run)
         values = (run.info.status.lower(), tags.get(AGENT_TAG), tags.get(OBS_TAG), given)
         allowed = (status, agent, obs, projections)
         return all(not some or value in some for value, some in zip(values, allowed, strict=True))
 
     return [run for run in runs if is_fit(run)]
+
+
+def projection_of(run: Run) -> str | None:
+    """Return the projection of a run's environment, as it is written in its parameters; None if it has none."""
+    return run.data.params.get("env.projection", run.data.params.get("projection"))
 
 
 def _projection_params(text: str) -> tuple[str, ...]:

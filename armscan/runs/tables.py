@@ -15,6 +15,7 @@ from rich.text import Text
 
 from armscan.errors import printable
 from armscan.runs.prune import PruneItem
+from armscan.runs.query import projection_of
 from armscan.runs.rows import RunRow
 from armscan.stats.on_plane import ON_PLANE
 from armscan.tracking.tags import AGENT_TAG, FOLDER_TAG, HOST_TAG, OBS_TAG, PARENT_TAG
@@ -120,7 +121,7 @@ def _values(row: RunRow) -> dict[str, Any]:
         *(row.started.isoformat(timespec="seconds"), row.duration_s),
         *(row.on_plane_rate, *row.on_plane, row.success_rate, row.mean_steps),
         *(row.n_bytes, row.in_folder, row.in_store, len(row.below)),
-        *(tags.get(AGENT_TAG), tags.get(OBS_TAG), row.run.data.params.get("projection")),
+        *(tags.get(AGENT_TAG), tags.get(OBS_TAG), projection_of(row.run)),
         *(tags.get(FOLDER_TAG), tags.get(HOST_TAG)),
     )
     return dict(zip(COLUMNS, values, strict=True))

@@ -98,6 +98,8 @@ def test_multimodal_brings_labels_to_0_to_1(phantom):
     body(observation)
     assert seen[0].shape == (5, 1, 36, 36)
     assert seen[0].unique().tolist() == [1.0]
+    # Batches may have any size.
+    assert body({name: images[:0] for name, images in observation.items()})[0].shape[0] == 0
 
 
 @pytest.mark.parametrize(

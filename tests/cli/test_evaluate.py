@@ -14,6 +14,7 @@ def test_evaluate_answers_mistakes_in_one_line(evaluate, tmp_path, data_folder):
         ([run_id, "--agent=sac", *FEW], f"'{run_id}' cannot be read"),
         ([run_id, "projection=zy"], f"'{run_id} projection=zy' configures an agent: give --agent NAME with it, or RUN"),
         ([run_id, "--projection=zy"], "No such option '--projection'."),
+        (["--agent=random", "seed=5"], "seed cannot be set here: give --seed NUMBER"),
         (["--agent=random", "agent=sac"], "agent cannot be set here: give --agent NAME"),
         (["xyz"], "the run is 'xyz', but it must be an id as MLflow shows it"),
         (["ffffffff"], "the run is 'ffffffff', but no run of sqlite:///"),

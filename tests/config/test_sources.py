@@ -3,9 +3,12 @@
 import pytest
 from hydra.errors import MissingConfigException
 
+from armscan.config.choices import choices, choices_help
 from armscan.config.compose import compose
 from armscan.config.defaults import default_tracking
 from armscan.config.sources import own_folders, sweeps_folder, working_folder
+from armscan.config.trust import check_composed
+from armscan.errors import InvalidValueError
 from tests.support import REPOSITORY
 
 MINE = "# @package _global_\n# One of my own.\ndefaults:\n  - /study/base\n  - _self_\nstudy:\n  name: mine\n"
@@ -66,6 +69,24 @@ def test_own_file_replaces_that_of_the_same_name_and_one_line_says_so(working, c
     (folder / "sweeps" / "sac_y.yaml").write_bytes((sweeps_folder() / "sac_y.yaml").read_bytes())
     assert compose(["sweep=sac_y"]).study.name == "sac_y"
     assert capsys.readouterr().err == ""
+
+
+def test_own_tracking_file_without_a_store_is_named(working):
+    folder = working(conf__tracking__mlflow="experiment: mine\n")
+    with pytest.raises(
+        InvalidValueError, match=rf"{folder}/conf/tracking/mlflow.yaml has no key 'uri', but it replaces"
+    ):
+        default_tracking()
+
+
+def test_what_editors_and_systems_leave_is_no_configuration(working):
+    folder = working(conf__agent__mine="lr: 1\n")
+    (folder / "conf" / "agent" / ".#mine.yaml").symlink_to("user@host.1")
+    (folder / "conf" / "agent" / "._mine.yaml").write_bytes(b"\0\xff")
+    assert "mine" in choices()["agent"]
+    assert not [name for name in choices()["agent"] if name.startswith(".")]
+    assert "  mine" in choices_help()
+    check_composed({}, where="job 1")
 
 
 def test_nothing_is_found_twice_in_the_checkout(monkeypatch, capsys):

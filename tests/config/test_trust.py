@@ -103,6 +103,8 @@ def test_offered_classes_are_of_runs_and_not_of_commands():
         "sweep=/elsewhere",
         'sweep="/elsewhere"',
         "sweep=sac_y, /elsewhere",
+        "sweep=sac_y",
+        "+sweep@_global_=sac_y",
     ],
 )
 def test_stored_command_line_that_could_execute_code_is_refused(word):

@@ -1,11 +1,35 @@
 """The files that describe the origin of a run."""
 
+import pytest
+
 from armscan.config.compose import compose_run
 from armscan.experiment.build import set_up
 from armscan.experiment.job import Invocation
 from armscan.experiment.provenance import start_tracking
+from armscan.runs.query import projection_of
+from armscan.tracking import open_existing_store
 from armscan.tracking.environment import Source
 from tests.support.tracked_runs import FEW
+
+
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        ([], "random-cluster-y-phantom-seed0"),
+        (["env.projection=zy", "env.stack=2", "env.memory=1"], "random-cluster-zy-stack2-memory1-phantom-seed0"),
+        (["env.observation=[slice,cluster]"], "random-slice+cluster-y-phantom-seed0"),
+        (["obs=slice", "env.observation=cluster"], "random-cluster-y-phantom-seed0"),
+    ],
+)
+def test_name_and_tags_of_a_run_are_of_its_environment(tmp_path, database, monkeypatch, words, name):
+    monkeypatch.chdir(tmp_path)
+    config, choices = compose_run([*FEW, "agent=random", *words])
+    tracked = start_tracking(config, Invocation(tmp_path, [], "", choices, None), set_up(config))
+    tracked.end("FINISHED")
+    run = open_existing_store(database).get_run(tracked.run_id)
+    assert run.info.run_name == name
+    assert run.data.tags["choice.obs"] == name.split("-")[1]
+    assert projection_of(run) == name.split("-")[2]
 
 
 def test_new_run_keeps_nothing_of_an_earlier_one_in_its_folder(tmp_path, database, monkeypatch):

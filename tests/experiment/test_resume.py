@@ -339,6 +339,15 @@ def test_resume_refuses_a_grid_that_has_finished(answer, cut_off):
     assert f"run {run_id} has finished: there is nothing to resume" in refused(answer, f"resume={run_id}")
 
 
+def test_resume_refuses_a_grid_whose_jobs_would_be_tracked_elsewhere(answer, cut_off, tmp_path):
+    client, run_id, _ = cut_off
+    client.set_tag(run_id, GRID_TAG, json.dumps(["agent=random", "seed=0,-1", "tracking.uri='sqlite:///mlruns.db'"]))
+    (tmp_path / "mlruns.db").rename(tmp_path / "lab.db")
+    line = refused(answer, f"resume={run_id}", "tracking.uri=sqlite:///lab.db")
+    assert f"run {run_id} was tracked in sqlite:///mlruns.db, where its jobs would be tracked again, and not in" in line
+    assert not (tmp_path / "mlruns.db").exists()
+
+
 def test_resume_refuses_a_run_of_something_else(answer, cut_off):
     client, run_id, _ = cut_off
     client.delete_tag(run_id, "folder")

@@ -23,6 +23,23 @@ def handlers():
         signal.signal(each, handler)
 
 
+def test_job_whose_folder_is_another_jobs_fails_and_touches_nothing(tmp_path, monkeypatch, capsys):
+    (tmp_path / "outcomes").mkdir()
+    started = []
+    monkeypatch.setattr(
+        job_process.subprocess, "run", lambda *_, **__: started.append(1) or SimpleNamespace(returncode=0)
+    )
+    jobs = [Job(number, f"a={number}", "", "b", tmp_path) for number in (0, 1, 0)]
+    for job in jobs:
+        job_process.start_job(None, Invocation(tmp_path / "same", [], "", {}, job), job)
+    # The first job may be started again, as after a requeue.
+    assert len(started) == 2
+    assert "is another job's: hydra.sweep.subdir must differ between jobs" in capsys.readouterr().err
+    outcomes = [json.loads((tmp_path / "outcomes" / f"{number}.json").read_text())["failure"] for number in (0, 1)]
+    assert outcomes[0] == job_process.NO_OUTCOME
+    assert "another job's" in outcomes[1]
+
+
 def test_interrupt_after_the_end_of_a_job_leaves_its_outcome_as_it_is(tmp_path, monkeypatch, handlers):
     (tmp_path / "outcomes").mkdir()
     job = Job(0, "a=1", "a=1", "b", tmp_path)
