@@ -15,7 +15,7 @@ from armscan.sweeps.results.judgement import Judgement
 from armscan.sweeps.results.selection import Candidate, score_rows
 from armscan.sweeps.results.summary import ConfigResult
 from armscan.sweeps.scheduling.population import searched_values
-from armscan.sweeps.scheduling.state import TEST_PREFIX, is_feasible, loss_signs
+from armscan.sweeps.scheduling.state import TEST_PREFIX, is_feasible, loss_signs, seconds_of
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.attribute_names import (
     ENV_STEPS,
@@ -83,14 +83,13 @@ def cause_of(trial: FrozenTrial) -> str:
 
 def _trial_row(trial: FrozenTrial, objectives: Sequence[str]) -> Row:
     values = dict(zip(objectives, trial.values or (), strict=False)) if trial.state == TrialState.COMPLETE else {}
-    seconds = trial.duration.total_seconds() if trial.duration is not None else None
     metrics = {f"figure/{name}": value for name, value in trial.user_attrs.get(METRICS, {}).items()}
     return {
         "trial": trial.number,
         "state": trial.state.name.lower(),
         **values,
         **({"feasible": is_feasible(trial)} if trial.constraints else {}),
-        "seconds": seconds,
+        "seconds": seconds_of(trial),
         "env_steps": trial.user_attrs.get(ENV_STEPS),
         "retry_of": trial.user_attrs.get(RETRY_OF),
         **({"taken_from": trial.user_attrs[TAKEN_FROM]} if TAKEN_FROM in trial.user_attrs else {}),

@@ -17,7 +17,7 @@ from rich.text import Text
 from armscan.errors import ArmscanError, printable
 from armscan.sweeps.results.summary import values_of
 from armscan.sweeps.scheduling.population import searched_values
-from armscan.sweeps.scheduling.state import StudyState, is_feasible
+from armscan.sweeps.scheduling.state import StudyState, is_feasible, seconds_of
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.attribute_names import ENV_STEPS, FAILURE, FINAL_SEED, FINALIST, LEASE, RETRIED, STOP
 from armscan.sweeps.storage.attributes import JUDGEMENT_SUFFIX
@@ -138,7 +138,7 @@ def status_line(opened: OpenedStudy, state: StudyState) -> str:
     ]
     if best := best_trials(opened.search.scheduler.study, 1):
         parts.append(f"best {values_of(best[0], settings.objectives)} (trial {best[0].number})")
-    durations = [trial.duration.total_seconds() for trial in state.finished if trial.duration is not None]
+    durations = [seconds for trial in state.finished if (seconds := seconds_of(trial)) is not None]
     if durations and opened.search.scheduler.end_reason(state) is None:
         left_s = (settings.n_trials - len(state.finished)) * fmean(durations) / settings.workers
         parts.append(f"about {left_s // 60:.0f} min left for the trials")

@@ -28,6 +28,7 @@ from armscan.sweeps.scheduling.state import (
 from armscan.sweeps.scheduling.termination import Termination
 from armscan.sweeps.storage.attribute_names import (
     ATTEMPT,
+    EARLIER_SPANS,
     ENV_STEPS,
     FAILURE,
     HOLDER,
@@ -195,6 +196,10 @@ class TrialScheduler:
             # Not if this worker was taken for dead, nor if only the reply was lost and another has claimed it since.
             if now.state == TrialState.RUNNING and is_own:
                 (writes or PendingWrites()).write()
+                assert now.datetime_start is not None
+                # The next worker's claim overwrites the start.
+                spans = [*now.user_attrs.get(EARLIER_SPANS, ()), (now.datetime_start.timestamp(), time.time())]
+                storage.set_trial_user_attr(trial_id, EARLIER_SPANS, spans)
                 # Names no process: a worker that dies between its claim and its lease must not be taken for this one.
                 storage.set_trial_user_attr(trial_id, LEASE, {**lease, "started": "", BEAT_S: time.time()})
                 storage.set_trial_state_values(trial_id, TrialState.WAITING)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any, Self, TypeVar
@@ -12,7 +12,7 @@ from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, Trial, TrialState
 from pydantic import Field
 
-from armscan.sweeps.storage.attribute_names import ENV_STEPS, FAILURE, LEASE, RETRIED, TAKEN_FROM
+from armscan.sweeps.storage.attribute_names import EARLIER_SPANS, ENV_STEPS, FAILURE, LEASE, RETRIED, TAKEN_FROM
 from armscan.sweeps.storage.reports import reports_of
 from armscan.utils.arrays import FloatArray
 from armscan.utils.section import Section
@@ -84,13 +84,27 @@ class StudyState:
     def busy_hours(self) -> float:
         """Wall time in hours during which at least one trial ran."""
         busy_s, until = 0.0, datetime.min
-        spans = [(trial.datetime_start, _last_seen(trial)) for trial in self.all if trial.datetime_start]
-        for start, end in sorted(spans):
+        for start, end in sorted(span for trial in self.all for span in _spans_of(trial)):
             # False within an earlier span, and if the clock was set back meanwhile.
             if end > max(start, until):
                 busy_s += (end - max(start, until)).total_seconds()
                 until = end
         return busy_s / 3600
+
+
+def seconds_of(trial: FrozenTrial) -> float | None:
+    """Return how long a finished trial ran, with the time before it was requeued; None if it was never run here."""
+    if trial.duration is None:
+        return None
+    return sum((end - start).total_seconds() for start, end in _spans_of(trial))
+
+
+def _spans_of(trial: FrozenTrial) -> Iterator[tuple[datetime, datetime]]:
+    """Yield the start and end of each time that a trial ran, also before it was requeued."""
+    for start_s, end_s in trial.user_attrs.get(EARLIER_SPANS, ()):
+        yield datetime.fromtimestamp(start_s), datetime.fromtimestamp(end_s)
+    if trial.datetime_start:
+        yield trial.datetime_start, _last_seen(trial)
 
 
 def _last_seen(trial: FrozenTrial) -> datetime:

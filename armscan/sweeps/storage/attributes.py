@@ -28,6 +28,8 @@ MAX_REASON_CHARS = 300
 LARGEST = 2**63 - 1
 MAX_STEP_DIGITS = 18
 Number = Annotated[int, Field(ge=0, le=LARGEST, description="a whole number of at least 0")]
+# Until the year 5138.
+Seconds = Annotated[float, Field(ge=0, le=1e11)]
 # Excludes keys that name a class, such as `agent._target_`.
 ScheduledKey = Annotated[str, Field(pattern=r"^(from_env_steps|agent\.[a-z]\w*)$")]
 Segment = dict[ScheduledKey, bool | int | Annotated[float, Field(allow_inf_nan=False)]]
@@ -91,6 +93,9 @@ class TrialAttributes(_Attributes):
     attempt: Number = 0
     seeds: dict[Annotated[str, Field(pattern=r"^[0-9]{1,10}$")], dict[str, float]] = Field(
         default={}, description="the metrics of each seed"
+    )
+    earlier_spans: list[Annotated[list[Seconds], Field(min_length=2, max_length=2)]] = Field(
+        default=[], description="pairs of seconds since 1970"
     )
     member: Number = 0
     generation: Number = 0

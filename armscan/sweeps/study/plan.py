@@ -18,7 +18,7 @@ from rich.text import Text
 
 from armscan.errors import printable
 from armscan.sweeps.scheduling.race import budget, round_size
-from armscan.sweeps.scheduling.state import StudyState
+from armscan.sweeps.scheduling.state import StudyState, seconds_of
 from armscan.sweeps.scheduling.termination import ended_because
 from armscan.sweeps.space.parameter import Parameter
 from armscan.sweeps.study.final_eval import FinalEvaluation, n_trainings, to_judge, training_of
@@ -78,7 +78,7 @@ def _print_cost(
     console: Console, settings: StudySettings, state: StudyState, final: FinalEvaluation | None, *, n_left: int
 ) -> None:
     """Print the cost of the finished trials, and an estimate for `n_left` trials and the final evaluation."""
-    timed = [(trial, trial.duration.total_seconds()) for trial in state.finished if trial.duration is not None]
+    timed = [(trial, spent_s) for trial in state.finished if (spent_s := seconds_of(trial)) is not None]
     seconds = [spent_s for _, spent_s in timed]
     mean_s = fmean(seconds)
     spent_mib = sum(map(_size_bytes, Path(settings.folder).rglob("*"))) / BYTES_A_MIB

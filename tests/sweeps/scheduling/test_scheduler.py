@@ -11,9 +11,10 @@ import optuna
 import pytest
 from optuna.trial import TrialState
 
-from armscan.sweeps.scheduling.state import PlannedTrial, StudyState
+from armscan.sweeps.scheduling.state import PlannedTrial, StudyState, seconds_of
 from armscan.sweeps.storage.attribute_names import (
     ATTEMPT,
+    EARLIER_SPANS,
     FAILURE,
     FINAL_SEED,
     FINALIST,
@@ -348,6 +349,23 @@ def test_requeued_trial_keeps_the_time_of_its_end_and_the_limit_stays_reached(ma
     spent_h = scheduler.state().busy_hours
     time.sleep(0.05)
     assert scheduler.state().busy_hours == spent_h
+
+
+def test_time_before_a_trial_was_requeued_is_counted_once_another_worker_has_it(make_scheduler):
+    scheduler = make_scheduler()
+    trial = scheduler.claim({"worker": "a"})
+    time.sleep(0.1)
+    scheduler.requeue(trial, {})
+    time.sleep(0.1)
+    trial = scheduler.claim({"worker": "b"})
+    time.sleep(0.1)
+    finish(scheduler, trial)
+    state = scheduler.state()
+    (finished,) = state.finished
+    assert state.busy_hours * 3600 == pytest.approx(seconds_of(finished), abs=1e-6)
+    ((start_s, end_s),) = finished.user_attrs[EARLIER_SPANS]
+    assert end_s - start_s >= 0.1
+    assert seconds_of(finished) == pytest.approx(end_s - start_s + finished.duration.total_seconds())
 
 
 def test_failures_of_final_trainings_that_had_begun_to_train_do_not_end_them(make_scheduler):
