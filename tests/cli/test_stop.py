@@ -99,7 +99,8 @@ def test_run_that_has_ended_is_not_interrupted(answer, run_with):
 
 def test_what_is_neither_run_nor_study_is_refused_as_both(answer, study, run_with):
     run_with()
-    for unknown in ("b", "nobody"):
+    # No ID of a run begins like these.
+    for unknown in ("x", "nobody"):
         code, _, said = answer(unknown)
         assert code == 2
         assert f"'{unknown}'" in said
