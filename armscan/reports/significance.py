@@ -76,8 +76,8 @@ def compare_groups(groups: Sequence[Group]) -> dict[str, list[Pair]]:
 
 def have_same_volumes(groups: Sequence[Group]) -> bool:
     """Return whether all groups were evaluated on the same volumes."""
-    first, *others = map(_volumes, groups)
-    return all(_are_same(first, each) for each in others)
+    volumes = [*map(_volumes, groups)]
+    return all(_are_same(volumes[0], each) for each in volumes[1:])
 
 
 def complement(probability: Estimate) -> Estimate:

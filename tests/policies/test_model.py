@@ -232,8 +232,9 @@ def test_run_keeps_its_policy_or_says_why_not_and_finishes(regression, tmp_path,
     )
     folder = tmp_path / "run"
     folder.mkdir()
-    config = {"projection": "zy", "obs": "cluster", "stack": 1, "memory": 0, "tracking": {"uri": "-"}}
-    config["env"] = {"rotation_bounds_deg": [90.0, 45.0], "translation_bounds_mm": [40.0, 300.0]}
+    rules = {"projection": "zy", "observation": "cluster", "stack": 1, "memory": 0}
+    bounds = {"rotation_bounds_deg": [90.0, 45.0], "translation_bounds_mm": [40.0, 300.0]}
+    config = {"tracking": {"uri": "-"}, "env": rules | bounds}
     (folder / "config.yaml").write_text(yaml.safe_dump(config))
     with TrackedRun.start(store, experiment_id, name="n", config={}, tags={}, folder=folder) as tracked:
         save_policy(Otherwise(learner, shift), env, tracked, folder, print)

@@ -159,6 +159,11 @@ def test_folds_of_a_grid_are_one_configuration_with_intervals_by_wrist(written, 
     assert final_metrics(group).estimates["mean_steps"].value == 3.0
 
 
+def test_report_of_runs_that_were_not_evaluated_is_made(written, make_training):
+    page, _ = written(make_training(evaluation=None))
+    assert "None of these runs has kept a final evaluation." in page
+
+
 def test_headline_names_no_best_of_groups_with_other_volumes_or_rules(written, make_training):
     rates = {"a": make_training(0, params={"agent.lr": "0.1"}), "b": make_training(0, params={"agent.lr": "0.2"})}
     page, _ = written(*rates.values())
