@@ -51,6 +51,8 @@ def print_result(opened: OpenedStudy) -> int:
     if scheduler.termination is not None and (ended := scheduler.termination.reason):
         told = f"the study has ended by itself: {ended}; study.n_trials or study.terminator change that"
         print_sentence(printable(told))
+    elif len(state.finished) < settings.n_trials and (limit := settings.limit_reason(state)):
+        print_sentence(f"the search has ended: {limit}")
     if settings.constraints and state.finished and not best_trials(scheduler.study, 1):
         print(f"no trial keeps all constraints: {', '.join(map(str, settings.constraints))}")
     _print_best(opened)

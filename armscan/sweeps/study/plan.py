@@ -67,6 +67,7 @@ def print_plan(
     console.print(f"done       {(done := len(state.finished))} trials{also}")
     if done:
         ended = ended_because(study, settings.asked) if study is not None else None
+        ended = ended or settings.limit_reason(state)
         if ended:
             console.print(printable(f"ended      {ended}"), markup=False, highlight=False)
         _print_cost(console, settings, state, final, n_left=0 if ended else max(0, settings.n_trials - done))

@@ -7,7 +7,7 @@ from optuna.trial import TrialState
 
 from armscan.sweeps.results.console import print_result
 from armscan.sweeps.scheduling.state import CONTROL, FAILURES_AT_ONCE
-from armscan.sweeps.storage.attribute_names import FINAL_SEED, FINALIST, METRICS
+from armscan.sweeps.storage.attribute_names import ENV_STEPS, FINAL_SEED, FINALIST, METRICS
 from armscan.sweeps.study.settings import FinalEvalSettings
 
 
@@ -28,6 +28,16 @@ def searched(study):
 def test_study_whose_workers_have_ended_before_its_trials_can_be_resumed(study, capsys):
     assert print_result(study) == os.EX_TEMPFAIL
     assert "only 0 of 5 trials have finished" in capsys.readouterr().err
+
+
+def test_limit_that_ended_the_search_is_named(opened, capsys):
+    study = opened(max_env_steps=100, final_eval=FinalEvalSettings(top_k=0, min_seeds=1, mean_seeds=1, judge_seeds=1))
+    trial = study.search.scheduler.claim({})
+    trial.set_user_attr(ENV_STEPS, 120)
+    study.search.scheduler.study.tell(trial, 1.0)
+    assert print_result(study) == 0
+    printed = capsys.readouterr().out
+    assert "the search has ended: the 100 environment steps of study.max_env_steps are taken" in printed
 
 
 def test_study_whose_final_trainings_are_missing_can_be_resumed(searched, capsys):
