@@ -13,6 +13,7 @@ from rich.text import Text
 from armscan.cli.options import FILE_PATH, CommaSeparated, clustering_option, examples
 from armscan.errors import InvalidValueError, print_error
 from armscan.utils.console import WHOLE_CHARS, print_sentence, print_table, wide_console
+from armscan.utils.text import counted
 
 if TYPE_CHECKING:
     from armscan.anatomy import FoundPlane
@@ -141,8 +142,7 @@ def _print_dataset(dataset: Dataset) -> None:
     n_volumes, n_subjects = len(dataset.reports), len(set(dataset.subjects.values()))
     n_labelled = sum(dataset.volumes[name].optimal_action is not None for name in dataset.reports)
     console.print(
-        f"{n_volumes} volume{'s' if n_volumes != 1 else ''} of {n_subjects} subject{'s' if n_subjects != 1 else ''}, "
-        f"{n_labelled} with a labelled plane",
+        f"{counted(n_volumes, 'volume')} of {counted(n_subjects, 'subject')}, {n_labelled} with a labelled plane",
         style="bold",
         highlight=False,
     )

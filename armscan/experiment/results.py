@@ -27,6 +27,7 @@ from armscan.training.baselines import RANDOM
 from armscan.training.headline import ABOVE_RANDOM, beside_random, headline
 from armscan.utils.files import BASELINES_FILE, EVALUATION_FILE, RESULTS_PAGE, atomic_write
 from armscan.utils.rate_text import PERCENT, formatted
+from armscan.utils.text import counted
 
 # First seeds of the final evaluations' episodes; those of the baselines do not depend on the seed of the run.
 TRAINING_VOLUMES_SEED, TEST_VOLUMES_SEED = 2 * 10**6, 3 * 10**6
@@ -204,7 +205,7 @@ def volume_notes(test: MetricEstimates, validation: MetricEstimates | None = Non
                 f"between or outside; {WHAT_HELPS}"
             ]
     numbers = {TEST: test.n_volumes} | ({VALIDATION: validation.n_volumes} if validation is not None else {})
-    few = [f"{n} {name.split()[0]} volume{'s' if n > 1 else ''}" for name, n in numbers.items() if n < MIN_VOLUMES]
+    few = [counted(n, f"{name.split()[0]} volume") for name, n in numbers.items() if n < MIN_VOLUMES]
     if not few:
         return []
     return [

@@ -33,6 +33,7 @@ from armscan.experiment.job import (
 from armscan.launch.launchers import LAUNCHER, check_launcher
 from armscan.tracking.tags import FAILURE_TAG, FOLDER_TAG, GRID_TAG, JOB_TAG
 from armscan.utils.files import LAST_CHECKPOINT, RESULTS_PAGE, atomic_write
+from armscan.utils.text import counted
 
 if TYPE_CHECKING:
     from mlflow.entities import Run
@@ -215,7 +216,7 @@ def _keep_page(table: ResultTable, folder: Path, parent: Mapping[str, Any], stor
 
     file, n_jobs = folder / RESULTS_PAGE, sum(map(bool, table.facts["outcome"]))
     body = f"<p><code>{html.escape(' '.join(parent['overrides']))}</code></p>{table.html()}"
-    atomic_write(file, page(f"Grid of {n_jobs} job{'s' if n_jobs > 1 else ''}", body))
+    atomic_write(file, page(f"Grid of {counted(n_jobs, 'job')}", body))
     store.log_artifact(parent["run_id"], str(file))
     set_description(store, parent["run_id"], table.markdown())
 

@@ -18,6 +18,7 @@ from armscan.reports.groups import Group
 from armscan.stats.aggregation import MIN_SEEDS
 from armscan.training import MetricEstimates
 from armscan.training.metric_display import is_rate, title_of
+from armscan.utils.text import counted
 
 # By metric, axis and index of the group.
 Curves = Mapping[tuple[str, str, int], Curve]
@@ -183,7 +184,7 @@ def _points(places: Iterable[float], values: Iterable[float]) -> Points:
 def _said(curve: Curve) -> list[str]:
     """Return the hover text of each point of a curve."""
     if curve.n_seeds < MIN_SEEDS:
-        n_seeds = f"{curve.n_seeds} seed{'s' if curve.n_seeds > 1 else ''}"
+        n_seeds = counted(curve.n_seeds, "seed")
         return [f"{value:.3g} ({n_seeds})" for value in curve.band.values]
     return [f"{value:.3g} ({low:.3g} to {high:.3g})" for value, low, high in zip(*curve.band, strict=True)]
 

@@ -32,6 +32,7 @@ from armscan.training.baselines import RANDOM
 from armscan.training.headline import headline
 from armscan.training.metric_display import title_of
 from armscan.training.result_table import with_baselines
+from armscan.utils.text import counted
 
 HOW_CURVES = (
     "On the validation volumes, after each epoch. Thick: the mean of the seeds of a group. Band: its 95 % interval "
@@ -119,19 +120,15 @@ def _summary(groups: Sequence[Group]) -> str:
         }
         for group, colour in zip(groups, colours(len(groups)), strict=True)
     ]
-    counted = f"{_counted(n_trainings, 'run')} in {_counted(len(groups), 'group')}"
+    runs = f"{counted(n_trainings, 'run')} in {counted(len(groups), 'group')}"
     same = "" if all(group.has_same_volumes for group in groups) else ", except for their volumes"
-    return f"<p>{counted}: those of a group differ by nothing but {by}{same}.</p>{table(rows, what='groups')}"
+    return f"<p>{runs}: those of a group differ by nothing but {by}{same}.</p>{table(rows, what='groups')}"
 
 
 def _seed_and_fold(training: TrackedTraining) -> str:
     """Return the seed of a training, and the fold that it was tested on."""
     seed = training.seed or "–"
     return seed if training.fold is None else f"{seed}, fold {training.fold}"
-
-
-def _counted(number: int, what: str) -> str:
-    return f"{number} {what}{'s' if number > 1 else ''}"
 
 
 def _learning(groups: Sequence[Group], curves: Curves) -> Iterator[str]:

@@ -12,6 +12,7 @@ from pathlib import Path
 from armscan.reports.select import EXPERIMENT, find_trainings, read_runs
 from armscan.tracking import open_existing_store
 from armscan.utils.files import ID_CHARS
+from armscan.utils.text import counted
 
 REPORTS = Path("reports")
 # A longer folder name is replaced by its hash.
@@ -42,11 +43,11 @@ def compare_runs(text: str, uri: str, out: str | None) -> Path:
     from armscan.reports.groups import group_trainings
     from armscan.reports.load import read_trainings
 
-    print(f"reading   {len(found)} run{'s' if len(found) > 1 else ''}", flush=True)
+    print(f"reading   {counted(len(found), 'run')}", flush=True)
     with tempfile.TemporaryDirectory() as folder:
         trainings = read_trainings(store, found, Path(folder))
     groups, left_out = group_trainings(trainings)
-    n_runs = f"{len(trainings)} run{'s' if len(trainings) > 1 else ''}"
+    n_runs = counted(len(trainings), "run")
     experiments = [name.removeprefix(EXPERIMENT) for name in named if name.startswith(EXPERIMENT)]
     title = f"{n_runs} of {', '.join(experiments)}" if len(experiments) == len(named) else n_runs
     return write_comparison(groups, left_out, title, Path(out) if out else REPORTS / _folder_name(named))

@@ -34,6 +34,7 @@ from armscan.training.metric_display import is_rate, leading_among, title_of, va
 from armscan.training.metrics import ENDS
 from armscan.utils.markdown import markdown_table
 from armscan.utils.rate_text import PERCENT, formatted
+from armscan.utils.text import counted
 
 MAXIMIZE = "maximize"
 # Prefixes of the metrics of a study's run that compare the chosen configuration with the control.
@@ -134,7 +135,7 @@ class Judgement:
     @property
     def compared(self) -> str:
         """The compared configurations and their seeds."""
-        seeds = f"{self.n_seeds} new seed{'s' if self.n_seeds > 1 else ''}"
+        seeds = counted(self.n_seeds, "new seed")
         return f"{name_of(self.chosen).capitalize()} and the control, both with the same {seeds}"
 
     @property

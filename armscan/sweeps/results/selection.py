@@ -19,6 +19,7 @@ from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.attribute_names import OBJECTIVES
 from armscan.sweeps.study.final_eval import NOTHING_SEARCHED, FinalEvaluation, key_of, name_of, settings_of
 from armscan.training.metric_display import bounds_of, is_rate, title_of, value_text
+from armscan.utils.text import counted
 
 ROW_PX, AROUND_PX = 44, 110
 
@@ -143,7 +144,7 @@ def decision_section(
     better = "higher" if final.sign > 0 else "lower"
     n_selected = sum(len(each.scores) for each in candidates)
     n_candidates = max(0, len(candidates) - 1)
-    n_seeds = f"{settings.min_seeds} seed{'s' if settings.min_seeds > 1 else ''}"
+    n_seeds = counted(settings.min_seeds, "seed")
     further = (
         "Further seeds went, in rounds, to the candidates where they most increase the probability of a correct "
         f"selection. The race ends at {settings.mean_seeds} seeds of each on average, or as soon as the leader is "

@@ -25,6 +25,7 @@ from armscan.sweeps.study.final_eval import FinalEvaluation, n_trainings, to_jud
 from armscan.sweeps.study.settings import FinalEvalSettings, StudySettings
 from armscan.sweeps.study.warm_start import InitialTrials
 from armscan.utils.console import WHOLE_CHARS, wide_console
+from armscan.utils.text import counted
 
 BYTES_A_MIB = 2**20
 
@@ -156,12 +157,12 @@ def _final(settings: FinalEvalSettings) -> str:
     fewest, most = n_trainings(settings)
     if not most:
         return "no final evaluation"
-    candidates = f"{settings.top_k} candidate{'s' if settings.top_k > 1 else ''}"
+    candidates = counted(settings.top_k, "candidate")
     n_first, n_mean = settings.min_seeds, settings.mean_seeds
     further = f" at first, and at most {n_mean} each on average," if n_first < n_mean else ""
     return (
         f"at least {fewest} and at most {most} final trainings: {candidates} and the control with "
-        f"{n_first} seed{'s' if n_first > 1 else ''} each{further} to select one, then that one and the control with "
+        f"{counted(n_first, 'seed')} each{further} to select one, then that one and the control with "
         f"{settings.judge_seeds} more each on the test volumes"
     )
 
