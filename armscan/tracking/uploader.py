@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import threading
@@ -78,8 +79,10 @@ class Uploader:
         self._woken.set()
         # The thread may hang in a request, which this process does not wait for.
         self._thread.join(0.5)
-        if self._outbox.is_uploaded:
-            return None
+        # Its folder may have been removed meanwhile.
+        with contextlib.suppress(OSError, TrackingError):
+            if self._is_done.is_set() or self._outbox.is_uploaded:
+                return None
         return "the store has not answered in time" if self._failure is None else reason_in(self._failure)
 
     def _work(self) -> None:
