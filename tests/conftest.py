@@ -203,7 +203,7 @@ def postgres(postgres_programs):
     """Yield a server for all tests of this process."""
     from tests.support.postgres import postgres_server
 
-    with postgres_server() as server:
+    with postgres_server(in_memory=True) as server:
         yield server
 
 

@@ -177,7 +177,9 @@ def print_table(found: dict[str, dict[str, Curve]]) -> None:
     print_head("experiment", "curve", *(f"length {length}" for length in LENGTHS))
     for name, of_name in found.items():
         for label, curve in of_name.items():
-            print_row(EXPERIMENTS[name].title, label, *(_reached(curve.reached(length)) for length in LENGTHS))
+            is_known = len(curve.lengths) >= N_SMOOTHED
+            cells = (_reached(curve.reached(length)) if is_known else "too few points" for length in LENGTHS)
+            print_row(EXPERIMENTS[name].title, label, *cells)
 
 
 def _reached(when: tuple[int, float] | None) -> str:

@@ -172,6 +172,8 @@ def main() -> None:
         ]
     )
     with tempfile.TemporaryDirectory() as folder, ways(Path(folder)) as compared:
+        # The first training of a process loads and compiles.
+        trained(config, None)
         costs: dict[str, list[Cost]] = {name: [] for name in compared}
         for number in range(given.rounds):
             for name, measure in compared.items():
