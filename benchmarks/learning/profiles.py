@@ -11,6 +11,7 @@ is; in depth, palmar.
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Iterable
 from dataclasses import replace
 
@@ -61,9 +62,11 @@ def landmarks(volume: LabelVolume) -> dict[str, float]:
     from_tendons = places - places[here, 1]
     ulnar = np.sign(from_tendons[here, 2, 0])
 
-    def least(low_mm: float, high_mm: float) -> int:
+    def least(low_mm: float, high_mm: float) -> tuple[int, float]:
+        """Return the index of the plane with the least bone, and its place; NaN at a limit, beyond which it may lie."""
         within = np.flatnonzero((low_mm <= PLACES_MM) & (high_mm >= PLACES_MM))
-        return int(within[bones[within].argmin()])
+        index = int(within[bones[within].argmin()])
+        return index, math.nan if index in within[[0, -1]] else float(PLACES_MM[index])
 
     def first(tissue: int) -> float:
         return float(PLACES_MM[np.flatnonzero(np.isfinite(places[:, tissue - 1, 0]))[0]])
@@ -71,17 +74,17 @@ def landmarks(volume: LabelVolume) -> dict[str, float]:
     is_grouped = n_tendons == 3
     joined = here + int(np.argmin(is_grouped[here:]))
     parted = here - int(np.argmin(is_grouped[here::-1]))
-    to_hand, to_proximal = least(-20, -6), least(2, 16)
-    to_forearm = least(PLACES_MM[to_proximal] + 9, 33)
+    (to_hand, hand_mm), (to_proximal, proximal_mm) = least(-20, -6), least(2, 16)
+    _, forearm_mm = least(PLACES_MM[to_proximal] + 9, 33)
     beyond, row, arm = (PLACES_MM.tolist().index(mm) for mm in (-30, 0, 40))
     found = {
         "tendons: three groups from, mm": PLACES_MM[parted] + 1,
         "tendons: three groups to, mm": PLACES_MM[joined] - 1,
         "tendons: middle of the groups, mm": (PLACES_MM[parted] + PLACES_MM[joined]) / 2,
         "tendons: bundle aside at 20 mm, mm": ulnar * from_tendons[here + 20, 1, 0],
-        "bones: gap to the metacarpals, mm": PLACES_MM[to_hand],
-        "bones: gap between the rows, mm": PLACES_MM[to_proximal],
-        "bones: gap to the forearm, mm": PLACES_MM[to_forearm],
+        "bones: gap to the metacarpals, mm": hand_mm,
+        "bones: gap between the rows, mm": proximal_mm,
+        "bones: gap to the forearm, mm": forearm_mm,
         "bones: area in the gap between the rows, mm2": bones[to_proximal],
         "bones: middle of the distal row, mm": np.average(
             PLACES_MM[to_hand:to_proximal], weights=bones[to_hand:to_proximal]
