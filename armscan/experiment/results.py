@@ -129,8 +129,8 @@ class RunResult:
         notes, n_volumes = volume_notes(self.figures[TEST], self.figures.get(VALIDATION)), self.figures[TEST].n_volumes
         if self.n_test_subjects is not None and self.n_test_subjects < n_volumes:
             notes.append(
-                f"the {n_volumes} test volumes are of {self.n_test_subjects} subjects: the intervals take each volume "
-                "for another wrist, and are too narrow"
+                f"the {n_volumes} test volumes are of {self.n_test_subjects} subjects: the intervals treat each volume "
+                "as a separate wrist, and are too narrow"
             )
         return notes
 
