@@ -81,7 +81,10 @@ def _check_store(run: Run, words: Sequence[str], uri: str) -> None:
     """
     given = [each for each in OverridesParser.create().parse_overrides([*words]) if each.key_or_group == TRACKING_URI]
     stored = str(given[-1].value()) if given else uri
-    places = [Path(sqlite_file(each)).resolve() if each.startswith(SQLITE_PREFIX) else each for each in (stored, uri)]
+    places = [
+        str(Path(sqlite_file(each)).resolve()) if each.startswith(SQLITE_PREFIX) else each.rstrip("/")
+        for each in (stored, uri)
+    ]
     if places[0] != places[1]:
         raise ResumeError(
             f"run {run.info.run_id} was tracked in {stored}, where its jobs would be tracked again, and not in {uri}: "
