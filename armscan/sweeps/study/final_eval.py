@@ -152,7 +152,7 @@ class FinalEvaluation:
     def scores(self) -> dict[int, dict[int, float]]:
         """Return the score of each ended training of the selection, by candidate and seed; NaN if it failed."""
         scores: dict[int, dict[int, float]] = {number: {} for number in self.candidates()}
-        for trial in _unforgiven(self.selection):
+        for trial in _counted_trials(self.selection):
             number, seed = training_of(trial)
             if number not in scores:
                 continue
@@ -193,13 +193,13 @@ class FinalEvaluation:
         """Number of trainings of the judgement, as far as they are known, that have not ended."""
         ended = {
             training_of(trial)
-            for trial in _unforgiven(self.judgement)
+            for trial in _counted_trials(self.judgement)
             if trial.state.is_finished() and RETRIED not in trial.user_attrs
         }
         return len({(number, seed) for number in to_judge(self.race()) for seed in self.judge_seeds} - ended)
 
     def _planned(self, trainings: Iterable[tuple[int, int]], study: optuna.Study) -> list[PlannedTrial]:
-        begun = set(map(training_of, _unforgiven(study)))
+        begun = set(map(training_of, _counted_trials(study)))
         searched = self.search.get_trials(deepcopy=False)
         return [
             PlannedTrial(settings_of(searched, number), _attributes(searched, number, seed))
@@ -218,10 +218,10 @@ def to_judge(race: Race) -> list[int]:
     return list(dict.fromkeys((race.chosen, CONTROL)))
 
 
-def _unforgiven(study: optuna.Study) -> list[FrozenTrial]:
-    """Return the trials of a study but those whose failure is forgiven, which are run again."""
-    forgiven = study.user_attrs.get(RESET_FAILURES, ())
-    return [trial for trial in study.get_trials(deepcopy=False) if trial.number not in forgiven]
+def _counted_trials(study: optuna.Study) -> list[FrozenTrial]:
+    """Return the trials of a study, except failed ones that are ignored since its last start and are run again."""
+    ignored = study.user_attrs.get(RESET_FAILURES, ())
+    return [trial for trial in study.get_trials(deepcopy=False) if trial.number not in ignored]
 
 
 def training_of(trial: FrozenTrial | Trial) -> tuple[int, int]:
