@@ -46,8 +46,8 @@ VOLUME_PREFIX = "volume/"
 NAMES = {name.replace(" ", "_"): name for name in (TEST, TRAINING)} | {"validation": LAST_VALIDATION}
 # Metrics of a run's MLflow model, besides the on-plane rates.
 OF_MODEL = ("median_distance_mm", "median_distance_deg", "success_rate", "mean_steps")
-# With fewer volumes intervals are clearly too narrow: docs/metrics.md.
-MIN_VOLUMES = 8
+# With fewer wrists intervals are clearly too narrow: docs/metrics.md.
+MIN_WRISTS = 8
 WHAT_HELPS = "more wrists, data=mixed, or cross-validation (data.folds=leave_one_out) would help"
 
 
@@ -60,14 +60,12 @@ class RunResult:
         baselines: Episodes of the baselines on the test volumes, by their names.
         validation: Validation of the best epoch; None for an agent that does not learn.
         own_baseline: Name of the baseline that equals the agent. Default: None, no baseline does.
-        n_test_subjects: Number of subjects of the test volumes. Default: None, each volume has its own.
     """
 
     evaluations: Mapping[str, Evaluation]
     baselines: Mapping[str, Evaluation]
     validation: Evaluation | None = None
     own_baseline: str | None = None
-    n_test_subjects: int | None = None
 
     @classmethod
     def of(cls, setup: Experiment, result: TrainingResult | None) -> RunResult:
@@ -86,7 +84,7 @@ class RunResult:
         }
         baselines = evaluate_baselines(setup.test_env, n_episodes=n_episodes, seed=TEST_VOLUMES_SEED, on_plane=on_plane)
         own = RANDOM if isinstance(agent, RandomAgent) else None
-        return cls(evaluations, baselines, result.best.evaluation if result else None, own, setup.split.n_test_subjects)
+        return cls(evaluations, baselines, result.best.evaluation if result else None, own)
 
     @cached_property
     def figures(self) -> dict[str, MetricEstimates]:
@@ -126,13 +124,7 @@ class RunResult:
 
     def notes(self) -> list[str]:
         """Return the notes on the volumes; see `volume_notes`."""
-        notes, n_volumes = volume_notes(self.figures[TEST], self.figures.get(VALIDATION)), self.figures[TEST].n_volumes
-        if self.n_test_subjects is not None and self.n_test_subjects < n_volumes:
-            notes.append(
-                f"the {n_volumes} test volumes are of {self.n_test_subjects} subjects: the intervals treat each volume "
-                "as a separate wrist, and are too narrow"
-            )
-        return notes
+        return volume_notes(self.figures[TEST], self.figures.get(VALIDATION))
 
     def write(self, folder: Path, *, title: str) -> None:
         """Write all episodes, and a page with the table, to the folder of the run."""
@@ -188,7 +180,7 @@ def _by_group(metrics: Mapping[str, float]) -> dict[str, MetricEstimates]:
 
 
 def volume_notes(test: MetricEstimates, validation: MetricEstimates | None = None) -> list[str]:
-    """Return the notes on a result's volumes: intervals that do not overlap, or too few volumes.
+    """Return the notes on a result's volumes: intervals that do not overlap, or too few wrists.
 
     Args:
         test: Metrics on the test volumes.
@@ -204,10 +196,10 @@ def volume_notes(test: MetricEstimates, validation: MetricEstimates | None = Non
                 "the intervals do not overlap: volumes differ more than episodes do, and other wrists may lie anywhere "
                 f"between or outside; {WHAT_HELPS}"
             ]
-    numbers = {TEST: test.n_volumes} | ({VALIDATION: validation.n_volumes} if validation is not None else {})
-    few = [counted(n, f"{name.split()[0]} volume") for name, n in numbers.items() if n < MIN_VOLUMES]
+    numbers = {TEST: test.n_subjects} | ({VALIDATION: validation.n_subjects} if validation is not None else {})
+    few = [counted(n, f"{name.split()[0]} wrist") for name, n in numbers.items() if n < MIN_WRISTS]
     if not few:
         return []
     return [
-        f"{' and '.join(few)}, fewer than {MIN_VOLUMES}: the intervals are too narrow for other wrists; {WHAT_HELPS}"
+        f"{' and '.join(few)}, fewer than {MIN_WRISTS}: the intervals are too narrow for other wrists; {WHAT_HELPS}"
     ]

@@ -28,7 +28,7 @@ TEST_GROUP = TEST.replace(" ", "_")
 def folds_table(runs: Iterable[tuple[Path, str]]) -> ResultTable | None:
     """Return one table over the folds of a grid, with the baselines; None if it is not a grid of folds.
 
-    Every subject is tested once for each seed, so that intervals resample volumes, as those of one run do.
+    Every subject is tested once for each seed, so that intervals resample subjects, as those of one run do.
 
     Args:
         runs: Folder of each run, and its overrides that differ from those of the others.

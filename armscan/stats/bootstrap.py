@@ -1,13 +1,13 @@
-"""Percentile bootstrap intervals of episodes that are grouped by volume.
+"""Percentile bootstrap intervals of episodes that are grouped by subject, the arm that a volume is of.
 
-An interval is for *other* volumes, and episodes on one volume are alike. So a resample draws volumes with replacement,
-then as many episodes of each drawn volume as it has, also with replacement. With one volume this is a bootstrap of its
-episodes, and describes that volume only. With several *seeds* of a training, a resample draws the seeds first; all
-drawn seeds share the drawn volumes, as all seeds were evaluated on the same volumes.
+An interval is for *other* subjects, and episodes on one arm are alike. So a resample draws subjects with replacement,
+then as many episodes of each drawn subject as it has, also with replacement. With one subject this is a bootstrap of
+its episodes, and describes that arm only. With several *seeds* of a training, a resample draws the seeds first; all
+drawn seeds share the drawn subjects, as all seeds were evaluated on the same volumes.
 
-With K volumes, the interval is a little too wide if volumes are alike. If they differ, it is too narrow, by about
-sqrt((K - 1) / K) and more for small K: no resampling knows volumes that it has never seen. If every episode has the
-same value, as at a success rate of 100 %, it has no width; `wilson` then gives one, for independent episodes.
+With K subjects, the interval is a little too wide if arms are alike. If they differ, it is too narrow, by about
+sqrt((K - 1) / K) and more for small K: no resampling knows arms that it has never seen. If every episode has the same
+value, as at a success rate of 100 %, it has no width; `wilson` then gives one, for independent episodes.
 """
 
 from __future__ import annotations
@@ -85,29 +85,27 @@ def interquartile_mean(samples: FloatArray) -> FloatArray:
 
 def estimates(
     columns: Mapping[str, tuple[Statistic, Sequence[float]]],
-    volumes: Sequence[Hashable],
+    subjects: Sequence[Hashable],
     *,
     trainings: Sequence[Hashable] | None = None,
-    seed: int = 0,
 ) -> dict[str, Estimate]:
-    """Return figures with their intervals, by name; all of them from the same resamples.
+    """Return figures with their intervals, by name; all from the same resamples, which are the same every time.
 
     Args:
         columns: Statistic and values of each figure, by its name; one value for each episode, NaN to leave it out.
-        volumes: Volume of each episode.
+        subjects: Subject of each episode's volume.
         trainings: Training of each episode; None if all are from one.
-        seed: Seed of the resampling; the same seed gives the same intervals.
 
     Raises:
-        InvalidValueError: If a column has another length than `volumes`, or there is no episode.
+        InvalidValueError: If a column has another length than `subjects`, or there is no episode.
     """
-    trainings = [None] * len(volumes) if trainings is None else trainings
+    trainings = [None] * len(subjects) if trainings is None else trainings
     lengths = {len(trainings), *(len(values) for _, values in columns.values())}
-    if not volumes or lengths != {len(volumes)}:
+    if not subjects or lengths != {len(subjects)}:
         raise InvalidValueError("every figure must have one value for each episode, and there must be an episode")
     arrays = {name: np.asarray(values, dtype=float) for name, (_, values) in columns.items()}
     resampled: dict[str, list[FloatArray]] = {name: [] for name in columns}
-    for places in _resamples(trainings, volumes, np.random.default_rng(seed)):
+    for places in _resamples(trainings, subjects):
         for name, (statistic, _) in columns.items():
             # Index -1, an unused place, reads the NaN that is appended here.
             resampled[name].append(statistic(np.append(arrays[name], np.nan)[places]))
@@ -154,17 +152,16 @@ def _estimate(value: float, resampled: FloatArray) -> Estimate:
     return Estimate(value, float(low), float(high))
 
 
-def _resamples(
-    trainings: Sequence[Hashable], volumes: Sequence[Hashable], rng: np.random.Generator
-) -> Iterator[NDArray[np.intp]]:
+def _resamples(trainings: Sequence[Hashable], subjects: Sequence[Hashable]) -> Iterator[NDArray[np.intp]]:
     """Yield the indices of the episodes of all resamples, shape (n_resamples, n_places), -1 for unused places."""
-    of_training, of_volume = _numbered(trainings), _numbered(volumes)
-    shape = int(of_training.max()) + 1, int(of_volume.max()) + 1
+    rng = np.random.default_rng(0)
+    of_training, of_subject = _numbered(trainings), _numbered(subjects)
+    shape = int(of_training.max()) + 1, int(of_subject.max()) + 1
     sizes = np.zeros(shape, dtype=np.intp)
-    np.add.at(sizes, (of_training, of_volume), 1)
+    np.add.at(sizes, (of_training, of_subject), 1)
     members = np.full((*shape, sizes.max()), -1)
     filled = np.zeros(shape, dtype=np.intp)
-    for place, cell in enumerate(zip(of_training, of_volume, strict=True)):
+    for place, cell in enumerate(zip(of_training, of_subject, strict=True)):
         members[(*cell, filled[cell])] = place
         filled[cell] += 1
     at_once = max(1, MAX_VALUES // members.size)
@@ -173,7 +170,7 @@ def _resamples(
         drawn_trainings = rng.integers(shape[0], size=(n_resamples, shape[0], 1, 1))
         drawn = drawn_trainings, rng.integers(shape[1], size=(n_resamples, 1, shape[1], 1))
         within = (rng.random((n_resamples, *members.shape)) * sizes[drawn]).astype(np.intp)
-        # Volumes with fewer episodes leave the rest of their row unused.
+        # Subjects with fewer episodes leave the rest of their row unused.
         chosen = np.where(np.arange(members.shape[-1]) < sizes[drawn], members[(*drawn, within)], -1)
         yield chosen.reshape(n_resamples, -1)
 

@@ -5,11 +5,12 @@ with random effects, with Satterthwaite's degrees of freedom (1946, doi:10.2307/
 readers and cases (Hillis 2014, doi:10.1002/sim.5926). With two or three seeds their mean square is often small by
 chance; the degrees of freedom are then those of the volumes, which is too many. So the interval is made at least as
 wide as Student's for other seeds alone, and for other volumes alone. Unlike a percentile bootstrap, it is then wide
-enough for few seeds and volumes.
+enough for few seeds and volumes. Several volumes of one subject (arm) are alike, and count as one: see `of_subjects`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -19,12 +20,13 @@ from armscan.stats.bootstrap import LEVEL, Estimate
 from armscan.utils.arrays import FloatArray
 
 
-def paired_difference(ours: FloatArray, theirs: FloatArray) -> Estimate:
-    """Return the mean difference, ours minus theirs, with its 95 % interval for other seeds and other volumes.
+def paired_difference(ours: FloatArray, theirs: FloatArray, subjects: Sequence[str] | None = None) -> Estimate:
+    """Return the mean difference, ours minus theirs, with its 95 % interval for other seeds and other subjects.
 
     Args:
         ours: Our scores, shape (seeds, volumes), all finite.
         theirs: Their scores for the same seeds and volumes.
+        subjects: Subject of each volume. Default: None, each volume is its own subject.
 
     Returns:
         The estimate; without an interval if there is one seed, which says nothing about others.
@@ -34,7 +36,8 @@ def paired_difference(ours: FloatArray, theirs: FloatArray) -> Estimate:
     """
     if ours.shape != theirs.shape:
         raise InvalidValueError(f"scores have the shapes {ours.shape} and {theirs.shape}, but both must have the same")
-    return mean_over_seeds(ours - theirs)
+    differences = ours - theirs
+    return mean_over_seeds(differences if subjects is None else of_subjects(differences, subjects))
 
 
 def mean_over_seeds(scores: FloatArray) -> Estimate:
@@ -49,6 +52,28 @@ def mean_over_seeds(scores: FloatArray) -> Estimate:
     mean, half = crossed_mean(scores)
     half = half if len(scores) > 1 else np.nan
     return Estimate(float(mean), float(mean - half), float(mean + half))
+
+
+def of_subjects(values: FloatArray, subjects: Sequence[str]) -> FloatArray:
+    """Return values of subjects instead of volumes, with the same mean.
+
+    A subject's value is its volumes' mean; its distance from the mean of all is multiplied by its number of volumes,
+    relative to other subjects': the linearised ratio estimator (Cochran 1977, Sampling Techniques, section 6.3).
+
+    Args:
+        values: Values, shape (..., seeds, volumes).
+        subjects: Subject of each volume.
+
+    Returns:
+        Values, shape (..., seeds, subjects).
+    """
+    names, number_of = np.unique(subjects, return_inverse=True)
+    n_subjects, n_volumes = len(names), len(subjects)
+    # Without the rounding below.
+    if n_subjects == n_volumes:
+        return values
+    centre = values.mean(axis=(-2, -1), keepdims=True)
+    return np.asarray(centre + (values - centre) @ np.eye(n_subjects)[number_of] * n_subjects / n_volumes)
 
 
 def crossed_mean(values: FloatArray) -> tuple[Any, Any]:

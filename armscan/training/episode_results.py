@@ -7,7 +7,8 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from operator import attrgetter
-from typing import Any, Self, get_type_hints
+from types import NoneType
+from typing import Any, Self, get_args, get_type_hints
 
 import gymnasium as gym
 
@@ -45,6 +46,7 @@ class EpisodeResult:
 
     Args:
         volume: Name of the volume.
+        subject: Subject of the volume. Default: None, the volume is the only one of its subject.
         seed: Seed of the reset.
         n_steps: Number of steps taken.
         is_success: Whether the episode ended on a rewarded plane.
@@ -69,6 +71,7 @@ class EpisodeResult:
     """
 
     volume: str
+    subject: str | None = None
     seed: int
     n_steps: int
     is_success: bool
@@ -205,6 +208,11 @@ class Evaluation:
         names = dict.fromkeys(episode.volume for episode in self.episodes)
         return {name: self._of(each for each in self.episodes if each.volume == name) for name in names}
 
+    @property
+    def subject_of(self) -> dict[str, str]:
+        """Subject of each volume, by name; a volume without one is its own subject."""
+        return {episode.volume: episode.subject or episode.volume for episode in self.episodes}
+
     def to_dict(self) -> dict[str, Any]:
         """Return the figures and every episode, ready for JSON."""
         limits = [list(each) for each in self.on_plane]
@@ -230,7 +238,7 @@ def _episode_of(plain: object) -> EpisodeResult:
     for name, value in plain.items():
         if name in OPTIONAL and value is None:
             continue
-        kind = float if name in OPTIONAL else KINDS[name]
+        kind = next((each for each in get_args(KINDS[name]) if each is not NoneType), KINDS[name])
         # In Python a bool is an int; JSON writes some floats as integers.
         is_of_kind = type(value) is kind or (kind is float and type(value) is int)
         if not is_of_kind or (kind in (int, float) and not -LARGEST < value < LARGEST):

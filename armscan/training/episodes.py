@@ -123,6 +123,7 @@ def _result(episode: Episode, seed: int, seconds: float, expected: Sequence[floa
     nerve_mm2, nerve_percent = nerve_area_error(*shown, episode.scene.volume.pixel_mm)
     return EpisodeResult(
         volume=episode.scene.volume.name,
+        subject=episode.scene.volume.subject,
         seed=seed,
         n_steps=episode.n_steps,
         is_success=episode.is_solved,

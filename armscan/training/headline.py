@@ -1,8 +1,8 @@
 """A result in a few sentences: its on-plane rate, whether it beats random planes, and its distance from the plane.
 
 The difference from the random agent is paired: the rates on each volume are compared, so that a volume that is easy
-for both does not hide what the agent adds. Its interval is for other volumes and, with several trainings, other seeds.
-If the difference is the same on all volumes, the interval is Newcombe's, which takes episodes as independent.
+for both does not hide what the agent adds. Its interval is for other wrists and, with several trainings, other seeds.
+If the difference is the same on all wrists, the interval is Newcombe's, which takes episodes as independent.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from armscan.stats.bootstrap import Estimate, difference_of_rates, wilson
-from armscan.stats.paired import crossed_mean
+from armscan.stats.paired import crossed_mean, of_subjects
 from armscan.training.episode_results import Evaluation
 from armscan.training.metric_display import interval_text
 from armscan.training.metrics import MetricEstimates
@@ -45,10 +45,12 @@ def beside_random(
     if not theirs or any(each.keys() != theirs.keys() for each in ours):
         return figures
     scores = np.array([[each[name] for name in theirs] for each in ours])
-    mean, half = crossed_mean(scores - np.array([*theirs.values()]))
+    assert random is not None
+    subject_of = random.subject_of
+    differences = of_subjects(scores - np.array([*theirs.values()]), [subject_of[name] for name in theirs])
+    mean, half = crossed_mean(differences)
     above = Estimate(float(mean), float(mean - half), float(mean + half)).clipped(-1.0, 1.0)
     if half < NO_WIDTH:
-        assert random is not None
         above = difference_of_rates(_wilson_of(trainings), _wilson_of([random]))
     return replace(figures, estimates={**figures.estimates, ABOVE_RANDOM: above})
 
@@ -99,7 +101,7 @@ def _verdict(above: Estimate | None) -> str:
     points = Estimate(*(100 * each for each in above))
     size = f"{points.value:+.1f} points"
     if math.isnan(points.low):
-        return f"Difference {size}, one volume and one seed: this allows no conclusion about others."
+        return f"Difference {size}, one wrist and one seed: this allows no conclusion about others."
     interval = f"{size} ({points.low:+.1f} to {points.high:+.1f})"
     if points.low > 0:
         return f"Better than random: {interval}."

@@ -20,7 +20,7 @@ NOT_STARTED_SOLVED, WILSON = "_not_started_solved", "_wilson"
 SUREST, LEAST_SURE = "_surest_quarter", "_least_sure_quarter"
 # Suffixes of the ends of an interval, and the names of the counts.
 ENDS = ("_low", "_high")
-COUNTS = ("volumes", "episodes", "episodes_started_solved")
+COUNTS = ("volumes", "subjects", "episodes", "episodes_started_solved")
 MEDIAN, P90, P95 = quantile(0.5), quantile(0.9), quantile(0.95)
 
 # Metrics by name: the statistic, and the value of an episode that it summarises.
@@ -48,6 +48,7 @@ class MetricEstimates:
     Args:
         n_seeds: Number of trainings that they summarise.
         n_volumes: Number of volumes that they summarise.
+        n_subjects: Number of their subjects, which intervals resample.
         n_episodes: Number of episodes.
         n_started_solved: Number of episodes that started on a rewarded plane.
         estimates: Metrics by name, over all episodes. Those whose names end with `_not_started_solved` are over the
@@ -57,6 +58,7 @@ class MetricEstimates:
 
     n_seeds: int
     n_volumes: int
+    n_subjects: int
     n_episodes: int
     n_started_solved: int
     estimates: Mapping[str, Estimate]
@@ -71,7 +73,7 @@ class MetricEstimates:
             trainings: Training of each episode; None if all are from one.
         """
         episodes = evaluation.episodes
-        volumes = [episode.volume for episode in episodes]
+        subject_of = evaluation.subject_of
         is_other = [not episode.starts_solved for episode in episodes]
         rates = {"success_rate": [float(episode.is_success) for episode in episodes]}
         for limits in evaluation.on_plane:
@@ -92,10 +94,11 @@ class MetricEstimates:
             wilsons[name + NOT_STARTED_SOLVED + WILSON] = wilson(int(sum(of_others)), len(of_others))
         return cls(
             n_seeds=1 if trainings is None else len(set(trainings)),
-            n_volumes=len(set(volumes)),
+            n_volumes=len(subject_of),
+            n_subjects=len(set(subject_of.values())),
             n_episodes=len(episodes),
             n_started_solved=len(episodes) - sum(is_other),
-            estimates=estimates(columns, volumes, trainings=trainings) | wilsons,
+            estimates=estimates(columns, [subject_of[each.volume] for each in episodes], trainings=trainings) | wilsons,
             on_plane=evaluation.on_plane,
         )
 
@@ -115,13 +118,13 @@ class MetricEstimates:
     def of_metrics(cls, metrics: Mapping[str, float]) -> MetricEstimates:
         """Return estimates from the numbers of `metrics` or of a run; without an interval if its ends are missing."""
         ends = {name + end for name in metrics for end in ENDS if name + end in metrics}
-        n_volumes, n_episodes, n_started_solved = (int(metrics.get(name, 0)) for name in COUNTS)
+        n_volumes, n_subjects, n_episodes, n_started_solved = (int(metrics.get(name, 0)) for name in COUNTS)
         found = {
             name: Estimate(value, *(metrics.get(name + end, math.nan) for end in ENDS))
             for name, value in metrics.items()
             if name not in ends and name not in COUNTS
         }
-        return cls(1, n_volumes, n_episodes, n_started_solved, found, limits_among(found))
+        return cls(1, n_volumes, n_subjects, n_episodes, n_started_solved, found, limits_among(found))
 
     def estimate(self, name: str) -> Estimate:
         """Return a figure as it is shown: NaN if there is none; with Wilson's interval if its own has no width."""
@@ -134,7 +137,7 @@ class MetricEstimates:
 
     def shown_metrics(self, names: Iterable[str]) -> dict[str, float]:
         """Return the numbers of these figures as they are shown; see `metrics`."""
-        counts = (self.n_volumes, self.n_episodes, self.n_started_solved)
+        counts = (self.n_volumes, self.n_subjects, self.n_episodes, self.n_started_solved)
         metrics: dict[str, float] = dict(zip(COUNTS, counts, strict=True))
         for name in names:
             metrics |= dict(zip((name, *(name + end for end in ENDS)), self.estimate(name), strict=True))

@@ -20,6 +20,7 @@ from armscan.training.metric_display import LEADING, OLDER, QUANTITIES, Quantity
 from armscan.training.metrics import MetricEstimates
 from armscan.utils.markdown import markdown_table
 from armscan.utils.rate_text import formatted
+from armscan.utils.text import counted
 
 # Maximum number of results that are columns side by side; with more, each is a line.
 MAX_ABREAST = 6
@@ -191,6 +192,8 @@ def _count(result: MetricEstimates, name: str) -> str:
     count = getattr(result, name)
     # Metrics of a validation do not have the number of its volumes.
     is_known = result.n_episodes and (count or name != "n_volumes")
+    if name == "n_volumes" and 0 < result.n_subjects < count:
+        return f"{count} ({counted(result.n_subjects, 'subject')})"
     return str(count) if is_known else MISSING
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -29,7 +29,6 @@ class Split:
         training: Volumes that the agent learns on.
         validation: Volumes of the validation after each epoch, which chooses the checkpoint and stops the training.
         test: Volumes of the final evaluation, which are not used in training.
-        subjects: Subject of each volume, by its name; a volume without one is its own. Default: none.
 
     Raises:
         InvalidValueError: If one of the three has no volume, or two have the same volume, or copies of it.
@@ -38,7 +37,6 @@ class Split:
     training: dict[str, LabelVolume]
     validation: dict[str, LabelVolume]
     test: dict[str, LabelVolume]
-    subjects: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for part, volumes in self.parts.items():
@@ -75,11 +73,6 @@ class Split:
     def parts(self) -> dict[str, dict[str, LabelVolume]]:
         """The volumes by split and name."""
         return {part: getattr(self, part) for part in PARTS}
-
-    @property
-    def n_test_subjects(self) -> int:
-        """Number of subjects of the test volumes."""
-        return len({self.subjects.get(name, name) for name in self.test})
 
     def fingerprints(self) -> Fingerprints:
         """Return a checksum of each volume's contents, by split and name."""
@@ -159,7 +152,7 @@ def nifti_data(
     dataset = open_dataset(check_path("data.path", path))
     parts = parts_by_subject(dataset, {"test": test, "validation": validation}, path, split_seed, folds, fold)
     ours = {part: {n: v for n, v in dataset.volumes.items() if parts[n] == part} for part in SPLITS}
-    return Split(ours["train"], ours["validation"], ours["test"], dataset.subjects)
+    return Split(ours["train"], ours["validation"], ours["test"])
 
 
 def mixed_data(
@@ -214,16 +207,11 @@ def mixed_data(
     if n_volumes is not None:
         check_int("data.n_volumes", n_volumes, at_least=1, at_most=len(dataset.volumes))
     names = sorted(dataset.volumes)[:n_volumes]
-    dataset = replace(
-        dataset,
-        volumes={name: dataset.volumes[name] for name in names},
-        subjects={name: dataset.subjects[name] for name in names},
-    )
+    dataset = replace(dataset, volumes={name: dataset.volumes[name] for name in names})
     parts = parts_by_subject(dataset, wanted, path, split_seed, folds, fold)
     ours = {part: {name: dataset.volumes[name] for name in names if parts[name] == part} for part in SPLITS}
     return Split(
         {**ours["train"], **(phantoms.training if n_beside else {})},
         ours["validation"] if "validation" in wanted else phantoms.validation,
         ours["test"] if "test" in wanted else phantoms.test,
-        dataset.subjects,
     )

@@ -31,7 +31,6 @@ class Dataset:
     Args:
         volumes: Volumes by file name, without the excluded ones.
         reports: Summary of each file, and of the volume made from it, by file name.
-        subjects: Subject of each volume, by file name; a volume without one is its own subject.
         splits: Split of each volume (`train`, `validation` or `test`), by file name; None if the manifest has no
             splits.
         excluded: Reason why a volume of the folder was left out, by file name.
@@ -39,9 +38,13 @@ class Dataset:
 
     volumes: dict[str, LabelVolume]
     reports: dict[str, VolumeReport]
-    subjects: dict[str, str]
     splits: dict[str, str] | None = None
     excluded: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def subjects(self) -> dict[str, str]:
+        """Subject of each volume, by file name; a volume without one is its own subject."""
+        return {name: volume.subject or name for name, volume in self.volumes.items()}
 
     def volumes_of(self, split: str) -> dict[str, LabelVolume]:
         """Return the volumes of `train`, `validation` or `test` by file name; none if there are no splits."""
@@ -85,12 +88,12 @@ def open_dataset(path: str | Path, *, require_manifest: bool = True) -> Dataset:
     if manifest.spacing == "finest":
         spacing = finest_spacing(volumes.values())
         volumes = {name: resample_kept(volume, spacing) for name, volume in volumes.items()}
+    volumes = {name: volume.of_subject(used[name].subject) for name, volume in volumes.items()}
     subjects = {name: entry.subject or name for name, entry in entries.items()}
     splits = None if manifest.splits is None else _split_of(manifest.splits, subjects, used, f"{found}: splits")
     return Dataset(
         volumes=volumes,
         reports={name: VolumeReport(volume, stored[name]) for name, volume in volumes.items()},
-        subjects={name: subjects[name] for name in used},
         splits=splits,
         excluded={name: str(entry.exclude) for name, entry in entries.items() if entry.exclude},
     )

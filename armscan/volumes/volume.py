@@ -40,6 +40,7 @@ class LabelVolume:
         optimal_action: Labelled plane, in the volume's own frame.
         origin: World coordinates (LPS) of voxel (0, 0, 0), in mm. Default: zeros.
         direction: Direction cosines of the array's axes in the world, as columns, shape (3, 3). Default: the identity.
+        subject: Name of the arm, of which there may be other volumes. Default: None, this volume is the only one.
 
     Raises:
         VolumeError: Naming the volume, if the labels are not a 3-D array of the labels above, a landmark is missing,
@@ -52,6 +53,7 @@ class LabelVolume:
     optimal_action: ManipulatorAction | None = None
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     direction: FloatArray = field(default_factory=lambda: np.eye(3))
+    subject: str | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):
@@ -82,6 +84,12 @@ class LabelVolume:
         volume = cls.__new__(cls)
         direction.flags.writeable = False
         vars(volume).update(rest, labels=labels, direction=direction, fingerprint=fingerprint)
+        return volume
+
+    def of_subject(self, subject: str | None) -> Self:
+        """Return a volume of this subject, with the same labels, which are neither checked nor copied."""
+        volume = self.__class__.__new__(self.__class__)
+        vars(volume).update(vars(self), subject=subject)
         return volume
 
     def __setstate__(self, state: dict[str, Any]) -> None:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from armscan.experiment.results import RunResult, evaluation_table, volume_notes
-from armscan.training import TEST, TRAINING, Evaluation, MetricEstimates
+from armscan.training import TEST, TRAINING, Evaluation, MetricEstimates, ResultTable
 from tests.training.test_result_table import made_episodes
 
 
@@ -18,18 +18,9 @@ def test_agent_that_is_a_baseline_has_one_row():
     assert list(beside.table().results) == ["agent, test", "random, test", "agent, training"]
 
 
-@pytest.mark.parametrize("n_subjects", [None, 7, 8])
-def test_volumes_of_the_same_subject_are_said(n_subjects):
-    played = {name: Evaluation(made_episodes(0, n_volumes=8)) for name in (TRAINING, TEST)}
-    notes = RunResult(played, {}, n_test_subjects=n_subjects).notes()
-    assert [note.partition(":")[0] for note in notes] == (
-        ["the 8 test volumes are of 7 subjects"] if n_subjects == 7 else []
-    )
-
-
 @pytest.mark.parametrize(
     ("n_test", "n_validation", "few"),
-    [(8, 8, None), (8, None, None), (8, 4, "4 validation volumes"), (1, 4, "1 test volume and 4 validation volumes")],
+    [(8, 8, None), (8, None, None), (8, 4, "4 validation wrists"), (1, 4, "1 test wrist and 4 validation wrists")],
 )
 def test_few_volumes_are_said_in_one_line(n_test, n_validation, few):
     test, validation = (
@@ -37,6 +28,15 @@ def test_few_volumes_are_said_in_one_line(n_test, n_validation, few):
     )
     notes = volume_notes(test, validation)
     assert [note.partition(", fewer than 8")[0] for note in notes] == ([few] if few else [])
+
+
+def test_volumes_of_one_subject_are_one_wrist():
+    of_pairs = tuple(replace(each, subject=str(int(each.volume[1:]) // 2)) for each in made_episodes(0, n_volumes=8))
+    figures = MetricEstimates.of(Evaluation(of_pairs))
+    assert volume_notes(figures)[0].startswith("4 test wrists, fewer than 8")
+    assert "8 (4 subjects)" in ResultTable({"agent": figures}).markdown()
+    of_pair_names = tuple(replace(each, volume=each.subject, subject=None) for each in of_pairs)
+    assert figures.estimates == MetricEstimates.of(Evaluation(of_pair_names)).estimates
 
 
 def test_validation_that_no_interval_shares_with_the_test_is_said_in_one_line():

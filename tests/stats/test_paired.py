@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from armscan.errors import InvalidValueError
-from armscan.stats.paired import crossed_mean, paired_difference
+from armscan.stats.paired import crossed_mean, of_subjects, paired_difference
 
 N_STUDIES = 4000
 
@@ -31,6 +31,20 @@ def test_interval_holds_the_truth_in_92_to_98_percent_of_studies(n_seeds, n_volu
 def test_interval_of_two_seeds_or_volumes_holds_the_truth_in_94_to_99_percent_of_studies(n_seeds, n_volumes, spread):
     means, halves = crossed_mean(drawn(np.random.default_rng(0), n_seeds, n_volumes, *spread))
     assert 0.94 <= (np.abs(means) <= halves).mean() <= 0.99
+
+
+@pytest.mark.parametrize("spread", [(1.0, 0.3, 1.0), (0.3, 1.0, 1.0), (0.7, 0.7, 0.5)])
+def test_interval_over_subjects_with_several_volumes_holds_the_truth_as_often_as_it_says(spread):
+    rng, n_seeds, of_subject = np.random.default_rng(0), 5, np.repeat(np.arange(12), [4, 3, 2, 2, *[1] * 8])
+    alike = drawn(rng, n_seeds, 12, *spread)[..., of_subject]
+    values = alike + 0.2 * rng.standard_normal(alike.shape)
+    covered = []
+    for each in (of_subjects(values, of_subject.astype(str)), values):
+        means, halves = crossed_mean(each)
+        np.testing.assert_allclose(means, values.mean(axis=(1, 2)))
+        covered.append((np.abs(means) <= halves).mean())
+    assert 0.92 <= covered[0] <= 0.98
+    assert covered[1] < covered[0]
 
 
 def test_interval_of_one_seed_is_for_other_volumes_and_that_of_one_volume_for_other_seeds():

@@ -18,7 +18,7 @@ from armscan.agents import (
 )
 from armscan.envs import EnvFactory, SliceChannelsObservation
 from armscan.errors import InvalidValueError
-from armscan.training import evaluate
+from armscan.training import Evaluation, evaluate
 from armscan.training.episodes import play
 from tests.agents.conftest import SMALL_MULTIMODAL, SMALL_PPO, SMALL_REGRESSION, SMALL_SAC
 
@@ -88,6 +88,15 @@ def test_more_episodes_than_side_by_side_are_played_in_turn(dataset, monkeypatch
     assert len({episode.n_steps for episode in alone}) > 1
     monkeypatch.setattr("armscan.training.episodes.MAX_SIDE_BY_SIDE", 3)
     assert evaluate(agent, env, n_episodes=8, seed=0).episodes == alone
+
+
+def test_episodes_name_the_subject_of_their_volume(dataset):
+    first, second, *_ = dataset
+    volumes = {first: dataset[first].of_subject("S1"), second: dataset[second]}
+    played = evaluate(made(Random(), VECTOR, volumes), VECTOR.make_env(volumes), n_episodes=2, seed=0)
+    assert played.subject_of == {first: "S1", second: second}
+    assert Evaluation.of_columns(played.columns()).episodes == played.episodes
+    assert volumes[first].fingerprint == dataset[first].fingerprint
 
 
 def test_mixed_precision_plays_the_same_side_by_side(dataset):

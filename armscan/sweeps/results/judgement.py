@@ -15,7 +15,7 @@ from armscan.experiment.results import volume_notes
 from armscan.stats.aggregation import probability_of_improvement
 from armscan.stats.bootstrap import Estimate
 from armscan.stats.paired import paired_difference
-from armscan.sweeps.results.summary import ConfigResult, final_results, final_table, scores_of
+from armscan.sweeps.results.summary import ConfigResult, final_results, final_table, scores_of, subjects_of
 from armscan.sweeps.scheduling.state import CONTROL, TEST_PREFIX, metrics_of_test
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.attribute_names import METRICS, OBJECTIVES
@@ -41,7 +41,7 @@ MAXIMIZE = "maximize"
 COMPARISONS = ("difference", "probability_of_improvement")
 HOW = (
     "A difference is the mean of the paired differences over all seeds and test volumes; its interval is for other "
-    "seeds and volumes. The probability of improvement is the probability that a training of the chosen configuration "
+    "seeds and wrists. The probability of improvement is the probability that a training of the chosen configuration "
     "is better on a volume than one of the control. Rates differ by percentage points."
 )
 
@@ -264,16 +264,16 @@ def _differences(
     metrics = [trial.user_attrs[METRICS] for trial in (*chosen, *control)]
     common = set.intersection(*map(set, metrics))
     tested = [name for name in metrics_of_test(metrics[0]) if TEST_PREFIX + name in common]
-    objectives = search.user_attrs[OBJECTIVES]
+    objectives, subject_of = search.user_attrs[OBJECTIVES], subjects_of(chosen[0])
     # First the objectives, by which the configuration was selected.
     for name in dict.fromkeys((*(name for name in objectives if name in tested), *leading_among(tested))):
-        scores = scores_of(TEST_PREFIX + name, metrics)
+        volumes, scores = scores_of(TEST_PREFIX + name, metrics)
         if not np.isfinite(scores).all():
             continue
         ours, theirs = scores[: len(chosen)], scores[len(chosen) :]
         is_higher_better = objectives[name] == MAXIMIZE if name in objectives else is_rate(name)
         sign = 1.0 if is_higher_better else -1.0
         probability = probability_of_improvement(sign * ours, sign * theirs)
-        paired = paired_difference(ours, theirs)
+        paired = paired_difference(ours, theirs, [subject_of.get(volume, volume) for volume in volumes])
         paired = paired.clipped(-1.0, 1.0) if is_rate(name) else paired
         yield Difference(name, is_higher_better, paired, probability)

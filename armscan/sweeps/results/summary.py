@@ -94,14 +94,23 @@ def _of_means(of_seeds: Sequence[Mapping[str, float]]) -> MetricEstimates:
     common = set.intersection(*map(set, of_seeds))
     of_seeds = [{name: value for name, value in metrics.items() if name in common} for metrics in of_seeds]
     names = [name for name in of_seeds[0] if name.startswith(TEST_PREFIX) and not OF_VOLUME.fullmatch(name)]
-    means = {name.removeprefix(TEST_PREFIX): mean_over_seeds(scores_of(name, of_seeds)) for name in names}
+    means = {name.removeprefix(TEST_PREFIX): mean_over_seeds(scores_of(name, of_seeds)[1]) for name in names}
     volumes = {match[1] for name in common if (match := OF_VOLUME.fullmatch(name))}
-    episodes, solved = (sum(int(each.get(TEST_PREFIX + name, 0)) for each in of_seeds) for name in COUNTS[1:])
-    return MetricEstimates(len(of_seeds), len(volumes), episodes, solved, means, limits_among(means))
+    episodes, solved = (sum(int(each.get(TEST_PREFIX + name, 0)) for each in of_seeds) for name in COUNTS[2:])
+    # Trials that stored no episodes did not know subjects either.
+    n_volumes = len(volumes)
+    return MetricEstimates(len(of_seeds), n_volumes, n_volumes, episodes, solved, means, limits_among(means))
 
 
-def scores_of(name: str, of_seeds: Sequence[Mapping[str, float]]) -> NDArray[np.float64]:
-    """Return a metric of shape (seeds, test volumes), or (seeds, 1) if it is not known for each volume."""
+def subjects_of(trial: FrozenTrial) -> dict[str, str]:
+    """Return the subject of each test volume; empty for older trials, which stored no episodes."""
+    played = _episodes(trial)
+    return played[TEST].subject_of if played else {}
+
+
+def scores_of(name: str, of_seeds: Sequence[Mapping[str, float]]) -> tuple[list[str], NDArray[np.float64]]:
+    """Return the test volumes and a metric, shape (seeds, volumes); of all together if they are unknown."""
     metric = name.removeprefix(TEST_PREFIX)
-    volumes = [key for key in of_seeds[0] if (found := OF_VOLUME.fullmatch(key)) and found[2] == metric]
-    return np.array([[metrics[key] for key in volumes or [name]] for metrics in of_seeds])
+    found = {match[1]: key for key in of_seeds[0] if (match := OF_VOLUME.fullmatch(key)) and match[2] == metric}
+    found = found or {"all": name}
+    return [*found], np.array([[metrics[key] for key in found.values()] for metrics in of_seeds])

@@ -126,4 +126,6 @@ def test_episodes_that_a_stranger_has_written_are_one_line(kept):
 def test_scores_are_of_each_volume_whatever_the_name_of_the_metric(metric):
     of_volumes = [f"test/volume/a/b/{metric}", f"test/volume/c/{metric}"]
     seeds = [dict(zip((f"test/{metric}", *of_volumes), (0.5, seed, 1.0), strict=True)) for seed in (2.0, 3.0)]
-    assert scores_of(f"test/{metric}", seeds).tolist() == [[2.0, 1.0], [3.0, 1.0]]
+    volumes, scores = scores_of(f"test/{metric}", seeds)
+    assert volumes == ["a/b", "c"]
+    assert scores.tolist() == [[2.0, 1.0], [3.0, 1.0]]
