@@ -1,4 +1,4 @@
-"""Imports of commands before they answer; benchmarks/speed/start.py measures how long they take."""
+"""Imports of commands before they answer; benchmarks/speed/commands.py measures how long they take."""
 
 import shutil
 import subprocess

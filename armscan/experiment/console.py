@@ -16,7 +16,7 @@ from armscan.training.baselines import RANDOM
 from armscan.training.headline import headline
 from armscan.training.result_table import HOW, with_baselines
 from armscan.utils.console import print_sentence, wide_console
-from armscan.utils.files import ID_CHARS
+from armscan.utils.run_files import ID_CHARS
 
 
 def print_table(title: str, table: ResultTable, notes: Iterable[str] = (), *, how: bool = True) -> None:

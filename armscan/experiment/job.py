@@ -19,7 +19,8 @@ from hydra.types import RunMode
 
 from armscan.config.command_hints import kept_command
 from armscan.errors import FolderInUseError, FolderTakenError, InvalidValueError
-from armscan.utils.files import CONFIG_FILE, LOCK_FILE, OUTBOX_FOLDER, OUTBOX_SUFFIXES, RUN_ID, atomic_write, sha256
+from armscan.utils.files import atomic_write, sha256
+from armscan.utils.run_files import CONFIG_FILE, LOCK_FILE, OUTBOX_FOLDER, OUTBOX_SUFFIXES, RUN_ID
 
 PARENT_FILE = "parent_run.json"
 OUTCOME_FOLDER = "outcomes"

@@ -27,7 +27,8 @@ from armscan.tracking import (
 )
 from armscan.tracking.tags import CHOICE, DOMAIN_TAG, FOLDER_TAG, HOST_TAG, JOB_TAG, VERSION_TAG
 from armscan.training import Fingerprints, TrainingDomain
-from armscan.utils.files import (
+from armscan.utils.files import atomic_write, sha256
+from armscan.utils.run_files import (
     CONFIG_FILE,
     DIFF_FILE,
     ENVIRONMENT_FILE,
@@ -37,8 +38,6 @@ from armscan.utils.files import (
     RESUMED_DIFF_FILE,
     SHA256_TAGS,
     VOLUMES_FILE,
-    atomic_write,
-    sha256,
 )
 
 CHOICES_IN_TAGS = ("data", "obs", "reward", "agent", "network")

@@ -25,8 +25,9 @@ from armscan.training import (
 )
 from armscan.training.baselines import RANDOM
 from armscan.training.headline import ABOVE_RANDOM, beside_random, headline
-from armscan.utils.files import BASELINES_FILE, EVALUATION_FILE, RESULTS_PAGE, atomic_write
+from armscan.utils.files import atomic_write
 from armscan.utils.rate_text import PERCENT, formatted
+from armscan.utils.run_files import BASELINES_FILE, EVALUATION_FILE, RESULTS_PAGE
 from armscan.utils.text import counted
 
 # First seeds of the final evaluations' episodes; those of the baselines do not depend on the seed of the run.

@@ -26,18 +26,15 @@ from armscan.experiment.runner import run_tracked
 from armscan.tracking import TrackedRun, TrackingStore, check_run_id, check_version, find_run, open_existing_store, sync
 from armscan.tracking.tags import FOLDER_TAG, GRID_TAG
 from armscan.training import Fingerprints, check_unchanged, fingerprints_in, resume_from_checkpoint
-from armscan.utils.files import (
+from armscan.utils.files import SQLITE_PREFIX, remove_unfinished, sha256, sqlite_file
+from armscan.utils.run_files import (
     CONFIG_FILE,
     LAST_CHECKPOINT,
     OUTBOX_FOLDER,
     OUTBOX_SUFFIXES,
     SHA256_TAGS,
-    SQLITE_PREFIX,
     VOLUMES_FILE,
     folder_lock,
-    remove_unfinished,
-    sha256,
-    sqlite_file,
 )
 from armscan.utils.strict_yaml import load_yaml
 

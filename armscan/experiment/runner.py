@@ -32,16 +32,16 @@ from armscan.training import (
 from armscan.training.progress import progress_reporter
 from armscan.utils.compilation import log_compilation
 from armscan.utils.console import print_sentence
-from armscan.utils.files import (
+from armscan.utils.files import named_if_full
+from armscan.utils.processes import no_garbage_collection
+from armscan.utils.run_files import (
     LAST_CHECKPOINT,
     LEARNING_CURVE_FILE,
     RESULTS_PAGE,
     VIDEO_FILE,
     check_free,
     folder_lock,
-    named_if_full,
 )
-from armscan.utils.processes import no_garbage_collection
 
 # First seeds of the episodes for each purpose, so that no episode serves two; see also `results`.
 VALIDATION_SEED, VIDEO_SEED = 10**6, 4 * 10**6

@@ -14,7 +14,8 @@ from armscan.reports.html import page
 from armscan.training import TEST, Evaluation, MetricEstimates, ResultTable
 from armscan.training.baselines import RANDOM
 from armscan.training.headline import beside_random, headline
-from armscan.utils.files import BASELINES_FILE, EVALUATION_FILE, RESULTS_PAGE, atomic_write
+from armscan.utils.files import atomic_write
+from armscan.utils.run_files import BASELINES_FILE, EVALUATION_FILE, RESULTS_PAGE
 
 if TYPE_CHECKING:
     from armscan.tracking import TrackingStore

@@ -32,7 +32,8 @@ from armscan.experiment.job import (
 )
 from armscan.launch.launchers import LAUNCHER, check_launcher
 from armscan.tracking.tags import FAILURE_TAG, FOLDER_TAG, GRID_TAG, JOB_TAG
-from armscan.utils.files import LAST_CHECKPOINT, RESULTS_PAGE, atomic_write
+from armscan.utils.files import atomic_write
+from armscan.utils.run_files import LAST_CHECKPOINT, RESULTS_PAGE
 from armscan.utils.text import counted
 
 if TYPE_CHECKING:

@@ -23,7 +23,7 @@ from armscan.experiment.resume import resume_run
 from armscan.experiment.runner import run_experiment
 from armscan.tracking import TrackingStore, open_store
 from armscan.tracking.tags import FOLDER_TAG, GRID_TAG, JOB_TAG, PARENT_TAG, STUDY_TAG
-from armscan.utils.files import LAST_CHECKPOINT
+from armscan.utils.run_files import LAST_CHECKPOINT
 
 if TYPE_CHECKING:
     from mlflow.entities import Run

@@ -25,7 +25,7 @@ from armscan.tracking import TrackedRun
 from armscan.tracking.client import reason_in
 from armscan.training.episode_results import Env
 from armscan.utils.arrays import FloatArray
-from armscan.utils.files import CONFIG_FILE, POLICY_FOLDER
+from armscan.utils.run_files import CONFIG_FILE, POLICY_FOLDER
 
 # Run tag that says whether the run has a model.
 POLICY_TAG = "policy"

@@ -24,7 +24,8 @@ from armscan.tracking.tags import CHOICE, PRUNED_TAG
 from armscan.training import TEST, Evaluation
 from armscan.training.fingerprints import Fingerprints, fingerprints_in
 from armscan.utils.arrays import FloatArray
-from armscan.utils.files import BASELINES_FILE, EVALUATION_FILE, ID_CHARS, SHA256_TAGS, VIDEO_FILE, VOLUMES_FILE, sha256
+from armscan.utils.files import sha256
+from armscan.utils.run_files import BASELINES_FILE, EVALUATION_FILE, ID_CHARS, SHA256_TAGS, VIDEO_FILE, VOLUMES_FILE
 
 WALL = "wall_s"
 VALIDATION = {

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from armscan.reports.select import EXPERIMENT, find_trainings, read_runs
 from armscan.tracking import open_existing_store
-from armscan.utils.files import ID_CHARS
+from armscan.utils.run_files import ID_CHARS
 from armscan.utils.text import counted
 
 REPORTS = Path("reports")

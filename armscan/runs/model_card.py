@@ -16,7 +16,7 @@ from armscan.tracking import FoundRun
 from armscan.tracking.sanitize import name_of
 from armscan.tracking.tags import EVALUATED_TAG
 from armscan.training import ON_PLANE, TEST, Evaluation, ResultTable
-from armscan.utils.files import BASELINES_FILE, EVALUATION_FILE
+from armscan.utils.run_files import BASELINES_FILE, EVALUATION_FILE
 
 # Longest description that MLflow's databases accept.
 MAX_CHARS = 5000

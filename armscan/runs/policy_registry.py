@@ -24,7 +24,7 @@ from armscan.tracking.logged_model import VERSIONS_TAG, model_of
 from armscan.tracking.run import MODEL_FILE
 from armscan.tracking.store import store_errors
 from armscan.training import TEST
-from armscan.utils.files import POLICY_FOLDER
+from armscan.utils.run_files import POLICY_FOLDER
 
 MAX_NAME_CHARS = 256
 # The alias of the latest version: `models:/NAME@champion`.

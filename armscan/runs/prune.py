@@ -19,7 +19,7 @@ from armscan.tracking.client import reason_in
 from armscan.tracking.notes import forget
 from armscan.tracking.sync import ENDED
 from armscan.tracking.tags import FOLDER_TAG, PARENT_TAG
-from armscan.utils.files import BEST_CHECKPOINT, LAST_CHECKPOINT
+from armscan.utils.run_files import BEST_CHECKPOINT, LAST_CHECKPOINT
 
 CHECKPOINTS, FOLDERS = "checkpoints", "folders"
 

@@ -24,7 +24,7 @@ from armscan.tracking.environment import COMMIT, CONSTRAINTS_SUM, DIFF_SUM, DIRT
 from armscan.tracking.sync import ENDED
 from armscan.tracking.tags import CHOICE, EVALUATED_TAG
 from armscan.training import check_unchanged
-from armscan.utils.files import DIFF_FILE, ENVIRONMENT_FILE, REPRODUCTION_FILE, folder_lock
+from armscan.utils.run_files import DIFF_FILE, ENVIRONMENT_FILE, REPRODUCTION_FILE, folder_lock
 
 # Tags of a reproduction: the original run, and whether all metrics are the same.
 OF_TAG, SAME_TAG = "reproduction.of", "reproduction.is_same"

@@ -17,7 +17,8 @@ from armscan.config.command_hints import armscan_command
 from armscan.errors import ArmscanError, TrackingError
 from armscan.tracking.outbox import LOCK, SUFFIX, UPLOADED, OutboxFile, file_and_place, file_of
 from armscan.tracking.tags import FOLDER_TAG, HOST_TAG
-from armscan.utils.files import (
+from armscan.utils.files import UNFINISHED, sha256
+from armscan.utils.run_files import (
     CONFIG_FILE,
     LOCK_FILE,
     OUTBOX_FOLDER,
@@ -26,9 +27,7 @@ from armscan.utils.files import (
     RESULTS,
     SHA256_TAGS,
     STARTED_WITH,
-    UNFINISHED,
     is_made_by_run,
-    sha256,
 )
 
 HYDRA_FOLDER = ".hydra"

@@ -19,7 +19,7 @@ from armscan.runs.tables import format_duration, narrow_table
 from armscan.tracking import TrackingStore
 from armscan.tracking.tags import EVALUATED_TAG, FAILURE_TAG, PARENT_TAG
 from armscan.utils.console import wide_console
-from armscan.utils.files import BEST_CHECKPOINT, ID_CHARS, LAST_CHECKPOINT
+from armscan.utils.run_files import BEST_CHECKPOINT, ID_CHARS, LAST_CHECKPOINT
 
 # Tags that say how a run was started; the first one that it has is shown.
 STARTED_BY = ("command", "overrides")

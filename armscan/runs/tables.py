@@ -21,8 +21,8 @@ from armscan.stats.on_plane import ON_PLANE
 from armscan.tracking.tags import AGENT_TAG, FOLDER_TAG, HOST_TAG, OBS_TAG, PARENT_TAG
 from armscan.utils.console import print_table, wide_console
 from armscan.utils.csv_file import write_csv
-from armscan.utils.files import ID_CHARS
 from armscan.utils.rate_text import PERCENT, formatted
+from armscan.utils.run_files import ID_CHARS
 
 MISSING = "-"
 # Longest name to show; that of a multirun is its command line.

@@ -7,8 +7,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from armscan.tracking.tags import CHOICE
-from armscan.utils.files import BEST_CHECKPOINT
 from armscan.utils.log import log
+from armscan.utils.run_files import BEST_CHECKPOINT
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient

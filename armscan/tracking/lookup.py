@@ -17,7 +17,8 @@ from armscan.errors import TrackingError, listed
 from armscan.tracking.client import TrackingStore, all_pages
 from armscan.tracking.store import open_existing_store, store_errors
 from armscan.tracking.tags import EVALUATED_TAG, VERSION_TAG
-from armscan.utils.files import BEST_CHECKPOINT, CONFIG_FILE, SHA256_TAGS, VOLUMES_FILE, sha256
+from armscan.utils.files import sha256
+from armscan.utils.run_files import BEST_CHECKPOINT, CONFIG_FILE, SHA256_TAGS, VOLUMES_FILE
 from armscan.utils.strict_yaml import load_yaml
 
 if TYPE_CHECKING:

@@ -23,15 +23,9 @@ from filelock import FileLock, Timeout
 
 from armscan.errors import FolderInUseError, TrackingError
 from armscan.tracking.notes import NOTES_FOLDER, Note, forget
-from armscan.utils.files import (
-    OUTBOX_FOLDER,
-    OUTBOX_SUFFIXES,
-    atomic_write,
-    cache_folder,
-    named_if_full,
-    truncate_torn_line,
-)
+from armscan.utils.files import atomic_write, cache_folder, named_if_full, truncate_torn_line
 from armscan.utils.processes import ProcessInfo
+from armscan.utils.run_files import OUTBOX_FOLDER, OUTBOX_SUFFIXES
 
 Entry = dict[str, Any]
 # Uploaded independently: metrics arrive even if the disk of the artifacts is full.

@@ -18,8 +18,9 @@ from armscan.tracking.sanitize import params_of, tags_of
 from armscan.tracking.system_metrics import PREFIX, SystemMetrics
 from armscan.tracking.tags import FAILURE_TAG, PARENT_TAG, PRUNED_TAG
 from armscan.tracking.uploader import Uploader
-from armscan.utils.files import RESULTS, RESUMED_DIFF_FILE, atomic_write
+from armscan.utils.files import atomic_write
 from armscan.utils.log import log
+from armscan.utils.run_files import RESULTS, RESUMED_DIFF_FILE
 
 if TYPE_CHECKING:
     from mlflow.entities import Run

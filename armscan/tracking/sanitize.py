@@ -9,7 +9,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from armscan.utils.files import CONFIG_FILE
+from armscan.utils.run_files import CONFIG_FILE
 
 # MLflow's own limits; a store refuses a whole request if one value is longer.
 MAX_KEY_CHARS, MAX_PARAM_CHARS, MAX_TAG_CHARS = 250, 6000, 8000

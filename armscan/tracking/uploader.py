@@ -17,9 +17,10 @@ from armscan.tracking.logged_model import upload_model
 from armscan.tracking.outbox import CHANNELS, Channel, Outbox, file_and_place
 from armscan.tracking.sanitize import MAX_PARAM_CHARS, MAX_TAG_CHARS, truncate
 from armscan.tracking.tags import NOTE_TAG
-from armscan.utils.files import RESULTS_PAGE, VOLUMES_FILE, sha256
+from armscan.utils.files import sha256
 from armscan.utils.log import log
 from armscan.utils.retry import FIRST_PAUSE_S
+from armscan.utils.run_files import RESULTS_PAGE, VOLUMES_FILE
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient

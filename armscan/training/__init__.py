@@ -14,7 +14,7 @@ from armscan.training.result_table import ResultTable
 from armscan.training.splits import PARTS, Split, mixed_data, nifti_data, phantom_data
 from armscan.training.train import Budget, SolvedCriterion, TrainingResult, train
 from armscan.training.video import VideoRecorder, outcome, record_episode
-from armscan.utils.files import BEST_CHECKPOINT, LAST_CHECKPOINT
+from armscan.utils.run_files import BEST_CHECKPOINT, LAST_CHECKPOINT
 
 __all__ = [
     "BEST_CHECKPOINT",

@@ -20,7 +20,7 @@ from armscan.training.callbacks import EpochReport, best_of
 from armscan.training.checkpoint_file import load_checkpoint, save_checkpoint
 from armscan.training.episode_results import Evaluation
 from armscan.training.fingerprints import Fingerprints, check_unchanged, fingerprints_in
-from armscan.utils.files import BEST_CHECKPOINT, LAST_CHECKPOINT
+from armscan.utils.run_files import BEST_CHECKPOINT, LAST_CHECKPOINT
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,7 +16,7 @@ from armscan.training.callbacks import Callback, EpochReport, best_of
 from armscan.training.checkpoint_file import load_checkpoint
 from armscan.training.checkpoints import CheckpointProvenance, save_checkpoints
 from armscan.training.episode_results import BEST_BY, SUCCESS, Evaluation
-from armscan.utils.files import BEST_CHECKPOINT
+from armscan.utils.run_files import BEST_CHECKPOINT
 from armscan.utils.validation import check_choice, check_float, check_int
 
 

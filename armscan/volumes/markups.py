@@ -26,6 +26,8 @@ SCHEMA = (
     "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/"
     "markups-schema-v1.0.3.json#"
 )
+# Name of the plane in Slicer.
+NAME = "optimal plane"
 # In mm of depth per mm: a flatter plane meets the volume's floor, where every plane begins, too far away.
 MIN_SLOPE = 1e-3
 # A rectangle counts as a slice of the volume if their sizes agree to this.
@@ -33,7 +35,7 @@ SAME_SIZE_MM = 0.01
 ROUNDING_MM = 1e-3
 
 
-def write_markup(path: str | Path, volume: LabelVolume, action: ManipulatorAction, name: str = "optimal plane") -> None:
+def write_markup(path: str | Path, volume: LabelVolume, action: ManipulatorAction) -> None:
     """Write a plane as the rectangle that its slice covers where Slicer shows the volume.
 
     The rectangle's x axis runs across and its y axis in depth; the normal completes a right-handed frame.
@@ -42,21 +44,19 @@ def write_markup(path: str | Path, volume: LabelVolume, action: ManipulatorActio
         path: File to write, ending in `.mrk.json`, in an existing folder.
         volume: Volume that the plane belongs to.
         action: Plane in the volume's frame.
-        name: Name of the plane in Slicer.
 
     Raises:
         InvalidValueError: If an argument has the wrong type.
         MarkupError: If the file cannot be written.
     """
     path = check_path("the markups file", path)
-    if not isinstance(volume, LabelVolume) or not isinstance(action, ManipulatorAction) or not isinstance(name, str):
+    if not isinstance(volume, LabelVolume) or not isinstance(action, ManipulatorAction):
         raise InvalidValueError(
-            f"volume, action and name are {volume!r}, {action!r} and {name!r}, but they must be a LabelVolume, a "
-            "ManipulatorAction and a string"
+            f"volume and action are {volume!r} and {action!r}, but they must be a LabelVolume and a ManipulatorAction"
         )
     if not path.name.endswith(MARKUP_SUFFIX):
         raise MarkupError(f"{path}: a markups file must end in {MARKUP_SUFFIX}, or Slicer does not know it as one")
-    document = {"@schema": SCHEMA, "markups": [_markup(volume, action, name)]}
+    document = {"@schema": SCHEMA, "markups": [_markup(volume, action)]}
     try:
         atomic_write(path, json.dumps(document, indent=2) + "\n")
     except OSError as error:
@@ -115,7 +115,7 @@ def read_markup(path: str | Path, volume: LabelVolume) -> ManipulatorAction:
     return slid
 
 
-def _markup(volume: LabelVolume, action: ManipulatorAction, name: str) -> dict[str, Any]:
+def _markup(volume: LabelVolume, action: ManipulatorAction) -> dict[str, Any]:
     origin_mm, axes = np.asarray(volume.origin), volume.direction
     across_mm, _, depth_mm = volume.size_mm
     centre = origin_mm + axes @ (action.matrix @ _slice_centre(volume) + action.offset_mm)
@@ -126,7 +126,7 @@ def _markup(volume: LabelVolume, action: ManipulatorAction, name: str) -> dict[s
     # No objectToBase: without it Slicer uses the identity (which it writes as diag(-1, -1, 1, 1) in LPS).
     return {
         "type": "Plane",
-        "name": name,
+        "name": NAME,
         "coordinateSystem": "LPS",
         "coordinateUnits": "mm",
         "locked": False,
@@ -138,7 +138,7 @@ def _markup(volume: LabelVolume, action: ManipulatorAction, name: str) -> dict[s
         "orientation": orientation.ravel().tolist(),
         "size": [across_mm, depth_mm, 0.0],
         "planeBounds": [-across_mm / 2, across_mm / 2, -depth_mm / 2, depth_mm / 2],
-        "controlPoints": [{"id": "1", "label": name, "position": centre.tolist(), "positionStatus": "defined"}],
+        "controlPoints": [{"id": "1", "label": NAME, "position": centre.tolist(), "positionStatus": "defined"}],
         # With handles, so that it can be corrected at once.
         "display": {"visibility": True, "opacity": 1.0, "handlesInteractive": True},
     }

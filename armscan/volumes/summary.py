@@ -31,11 +31,6 @@ class StoredFile:
     missing: tuple[Source, ...]
     crop_mm: Crop | None
 
-    @property
-    def ignored(self) -> tuple[Source, ...]:
-        """Values and segments of the file, except 0, that became background."""
-        return tuple(each.source for each in self.found if each.label == BACKGROUND and each.source != 0)
-
 
 @dataclass(frozen=True)
 class VolumeReport:

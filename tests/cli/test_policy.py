@@ -13,7 +13,7 @@ from armscan.policies.model import model_sha256
 from armscan.runs.model_card import MAX_CHARS
 from armscan.tracking.tags import EVALUATED_TAG
 from armscan.training import load_checkpoint, save_checkpoint
-from armscan.utils.files import BEST_CHECKPOINT
+from armscan.utils.run_files import BEST_CHECKPOINT
 from tests.support.refusals import assert_refused
 from tests.support.tracked_runs import GUESSER, IMAGES, store_of, tracked
 from tests.test_run import runs_in

@@ -14,7 +14,8 @@ from armscan.policies.build import SUM_TAG
 from armscan.policies.model import CODE, model_sha256
 from armscan.tracking.outbox import Address, Outbox
 from armscan.tracking.tags import DOMAIN_TAG, GRID_TAG, VERSION_TAG
-from armscan.utils.files import CONFIG_FILE, SHA256_TAGS, VOLUMES_FILE, sha256
+from armscan.utils.files import sha256
+from armscan.utils.run_files import CONFIG_FILE, SHA256_TAGS, VOLUMES_FILE
 from tests.cli.test_policy import registered
 from tests.support.refusals import assert_refused
 from tests.support.stores import store_in

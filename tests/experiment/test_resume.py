@@ -16,7 +16,8 @@ import armscan
 from armscan.tracking.outbox import Address, Outbox
 from armscan.tracking.tags import GRID_TAG
 from armscan.training import load_checkpoint
-from armscan.utils.files import CONFIG_FILE, LAST_CHECKPOINT, VOLUMES_FILE, folder_lock, sha256
+from armscan.utils.files import sha256
+from armscan.utils.run_files import CONFIG_FILE, LAST_CHECKPOINT, VOLUMES_FILE, folder_lock
 from tests.support.killed_at import Moment, commands
 from tests.support.processes import COMMAND, start_run
 from tests.support.stores import store_in

@@ -15,7 +15,7 @@ from armscan.launch.folds_table import AGENT, folds_table, keep_table
 from armscan.launch.grid_plan import print_grid_plan
 from armscan.tracking.tags import NOTE_TAG
 from armscan.training import TEST, Evaluation, MetricEstimates
-from armscan.utils.files import RESULTS_PAGE
+from armscan.utils.run_files import RESULTS_PAGE
 from tests.support.stores import store_in
 from tests.training.test_train import episode_of
 

@@ -9,7 +9,8 @@ import pytest
 
 from armscan.experiment.provenance import place_tags
 from armscan.tracking import TrackedRun
-from armscan.utils.files import CONFIG_FILE, SHA256_TAGS, sha256
+from armscan.utils.files import sha256
+from armscan.utils.run_files import CONFIG_FILE, SHA256_TAGS
 from tests.support.stores import store_in
 
 HOLDER = """

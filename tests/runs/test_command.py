@@ -14,7 +14,7 @@ from armscan.runs.query import find
 from armscan.runs.run_folder import RunSkippedError
 from armscan.tracking import open_store
 from armscan.tracking.outbox import file_of
-from armscan.utils.files import LOCK_FILE
+from armscan.utils.run_files import LOCK_FILE
 from tests.support import FEW_VOLUMES, REPOSITORY
 from tests.support.refusals import assert_refused
 

@@ -10,7 +10,7 @@ import pytest
 
 from armscan.tracking.notes import NOTES_FOLDER
 from armscan.tracking.outbox import file_of
-from armscan.utils.files import LOCK_FILE
+from armscan.utils.run_files import LOCK_FILE
 
 
 def ids_in(folder, stage="active"):

@@ -13,7 +13,8 @@ from armscan.experiment.build import build_experiment
 from armscan.tracking import TrackedRun
 from armscan.tracking.tags import DOMAIN_TAG
 from armscan.training import TrainingDomain, save_checkpoint
-from armscan.utils.files import SHA256_TAGS, sha256
+from armscan.utils.files import sha256
+from armscan.utils.run_files import SHA256_TAGS
 from tests.support import FEW_VOLUMES
 from tests.support.stores import store_in
 

@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all, and folders locked by one process."""
+"""Files that are written whole or not at all."""
 
 import errno
 import os
@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from armscan.errors import FolderInUseError
-from armscan.utils.files import atomic_write, check_writable, folder_lock, remove_unfinished, truncate_torn_line
+from armscan.utils.files import atomic_write, check_writable, remove_unfinished, truncate_torn_line
 
 
 def test_file_whose_writer_fails_stays_as_it_was(tmp_path):
@@ -96,21 +95,6 @@ def test_torn_line_is_removed_and_no_other(tmp_path_factory, lines, torn):
     path.write_bytes(b"".join(lines) + torn.replace(b"\n", b""))
     truncate_torn_line(path)
     assert path.read_bytes() == b"".join(lines)
-
-
-def test_folder_is_free_again_when_its_process_was_killed(tmp_path):
-    program = (
-        "import sys, time; from pathlib import Path; from armscan.utils.files import folder_lock\n"
-        "with folder_lock(Path(sys.argv[1])): print('held', flush=True); time.sleep(900)"
-    )
-    process = subprocess.Popen([sys.executable, "-c", program, tmp_path], stdout=subprocess.PIPE, text=True)
-    assert process.stdout.readline() == "held\n"
-    with pytest.raises(FolderInUseError, match="another process"), folder_lock(tmp_path):
-        pass
-    process.kill()
-    process.wait()
-    with folder_lock(tmp_path):
-        atomic_write(tmp_path / "a", b"x")
 
 
 @pytest.mark.parametrize("is_hidden", [False, True], ids=["itself", "behind another"])

@@ -144,7 +144,6 @@ def test_report_tells_what_the_file_held_and_what_became_of_it(write_labelmap, t
     report = open_dataset(tmp_path).reports["a.nrrd"]
     assert {each.source: (each.label, each.n_voxels) for each in report.stored.found}[999] == (0, 5)
     assert report.stored.missing == (11,)
-    assert report.stored.ignored == (999,)
     assert report.n_voxels["bones"] == (tiny_volume.labels == 1).sum()
     assert report.tissue_mm3["bones"] == pytest.approx(0.5 * (tiny_volume.labels == 1).sum())
     assert report.n_voxels["nerve"] == 0

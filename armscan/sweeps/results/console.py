@@ -27,7 +27,7 @@ from armscan.sweeps.study.study import best_trials
 from armscan.sweeps.tasks.attempt import trial_folder
 from armscan.training.metric_display import title_of, value_text
 from armscan.utils.console import WHOLE_CHARS, print_sentence, wide_console
-from armscan.utils.files import RUN_FILE
+from armscan.utils.run_files import RUN_FILE
 
 
 def print_result(opened: OpenedStudy) -> int:

@@ -24,7 +24,7 @@ from armscan.sweeps.storage.attribute_names import FINALIST, FOLDER, LEASE, OBJE
 from armscan.sweeps.study.final_eval import FinalEvaluation, name_of, settings_of
 from armscan.sweeps.study.study import best_trials
 from armscan.training.metric_display import title_of, value_text
-from armscan.utils.files import ID_CHARS
+from armscan.utils.run_files import ID_CHARS
 
 # Names of trial states for users.
 STATES = {"complete": "finished", "fail": "failed"}

@@ -21,7 +21,7 @@ from armscan.sweeps.study.settings import StudySettings
 from armscan.sweeps.tasks.attempt import Attempt, trial_folder
 from armscan.tracking import TrackingStore, abandon
 from armscan.tracking.tags import FAILURE_TAG, STORAGE_TAG, STUDY_TAG, TRIAL_TAG
-from armscan.utils.files import LAST_CHECKPOINT
+from armscan.utils.run_files import LAST_CHECKPOINT
 
 WORKER_DIED = "its worker died"
 

@@ -11,7 +11,7 @@ from armscan.errors import CheckpointError, InvalidValueError
 from armscan.experiment.build import Experiment
 from armscan.sweeps.tasks.attempt import Attempt
 from armscan.training import EpochReport, take_over_checkpoints
-from armscan.utils.files import RUN_FILE
+from armscan.utils.run_files import RUN_FILE
 
 
 def begin_generation(attempt: Attempt, setup: Experiment, folder: Path, *, run_id: str) -> list[EpochReport]:

@@ -38,9 +38,10 @@ from armscan.training import (
     record_episode,
     resume_from_checkpoint,
 )
-from armscan.utils.files import LAST_CHECKPOINT, LEARNING_CURVE_FILE, RUN_FILE, VIDEO_FILE, atomic_write, folder_lock
+from armscan.utils.files import atomic_write
 from armscan.utils.log import log
 from armscan.utils.retry import RETRY_S
+from armscan.utils.run_files import LAST_CHECKPOINT, LEARNING_CURVE_FILE, RUN_FILE, VIDEO_FILE, folder_lock
 
 if TYPE_CHECKING:
     from mlflow.entities import Run

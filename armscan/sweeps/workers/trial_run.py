@@ -17,7 +17,7 @@ from armscan.sweeps.tasks.attempt import trial_folder
 from armscan.tracking import TrackedRun, run_of_study
 from armscan.tracking.run import SHORT_WAIT_S
 from armscan.tracking.tags import FOLDER_TAG, PARENT_TAG, STUDY_TAG, TRIAL_TAG
-from armscan.utils.files import CONFIG_FILE, SHA256_TAGS
+from armscan.utils.run_files import CONFIG_FILE, SHA256_TAGS
 
 
 def open_run(

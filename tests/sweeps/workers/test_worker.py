@@ -29,8 +29,8 @@ from armscan.sweeps.workers import heartbeat, worker
 from armscan.sweeps.workers.heartbeat import Heartbeat
 from armscan.sweeps.workers.worker import Worker
 from armscan.tracking import TrackedRun, open_store
-from armscan.utils.files import LAST_CHECKPOINT
 from armscan.utils.processes import ProcessInfo
+from armscan.utils.run_files import LAST_CHECKPOINT
 from tests.support.waiting import HANG_S
 
 SPACE = {"agent.lr": {"low": 1e-4, "high": 1e-2, "log": True}, "agent.batch_size": {"choices": [64, 128, 256]}}

@@ -1,6 +1,6 @@
 """Measure how long a fresh process takes to `import armscan`, and from there to its first steps.
 
-    python -m benchmarks.speed.startup
+    python -m benchmarks.speed.imports
 
 Each figure is the best of several fresh processes, after one that has compiled everything and made the phantoms.
 """

@@ -1,6 +1,6 @@
 """Measure the processor time of commands until they answer, and of a run until it trains, in fresh processes.
 
-    python -m benchmarks.speed.start [--before CHECKOUT]
+    python -m benchmarks.speed.commands [--before CHECKOUT]
 
 Each figure is the least of several processes, after one that has compiled everything, made the phantoms and the store.
 With `--before`, each process of this checkout follows one of the other, whose figure stands beside it. A command that
