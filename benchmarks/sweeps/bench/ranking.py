@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import joblib
 import numpy as np
@@ -21,10 +21,31 @@ SAMPLERS, PRUNERS = ("random", "tpe", "cmaes", "nsga2"), ("none", "median", "hal
 TWO_SEEDS = ("random", "tpe")
 # The rule that all are compared with.
 REFERENCE = Rule("random", "none")
-# Candidates of the final evaluation; seeds of each at first and on average, and whether the control races, too. Rules
-# are ranked without the control: chosen in place of bad candidates, it hides what a sampler finds.
-TOP_K = 3
-FINALS = {"fixed": (5, 5, False), "race": (2, 6, False), "control": (2, 6, True)}
+
+
+class Final(NamedTuple):
+    """Rule of a final evaluation.
+
+    Args:
+        min_seeds: Seeds that each configuration gets.
+        mean_seeds: Seeds of a configuration on average, at most.
+        has_control: Whether the control races, too. Default: True.
+        top_k: Number of the best trials that race. Default: 3.
+    """
+
+    min_seeds: int
+    mean_seeds: int
+    has_control: bool = True
+    top_k: int = 3
+
+
+# Rules are ranked without the control: chosen in place of bad candidates, it hides what a sampler finds.
+FINALS = {
+    "fixed": Final(5, 5, has_control=False),
+    "race": Final(2, 6, has_control=False),
+    "control": Final(2, 6),
+    "eight": Final(2, 6, top_k=8),
+}
 
 
 def rules(samplers: Sequence[str] = SAMPLERS) -> Iterator[Rule]:
@@ -70,12 +91,14 @@ def studies_of(
         if workers > 1:
             silence()
         found = search(surrogate, sweep, rule, n_trainings=n_trainings, seed=number)
-        tops = [candidate.config for candidate in found.candidates[:TOP_K]]
+        tops = [candidate.config for candidate in found.candidates[: max(final.top_k for final in FINALS.values())]]
         row = {**vars(rule), "study": number, "n_trials": found.n_trials, "search": tops[0].truth - best}
-        racing = [*tops, control]
-        scores = scores_of(racing, MAX_SEEDS, np.random.default_rng(number))
-        for name, (low, mean, has_control) in FINALS.items():
-            chosen = choose(scores if has_control else scores[:-1], min_seeds=low, mean_seeds=mean)
+        scores = scores_of([control, *tops], MAX_SEEDS, np.random.default_rng(number))
+        for name, final in FINALS.items():
+            # The control is first, so that it wins a tie, as in armscan.
+            racing = [control, *tops][not final.has_control : 1 + final.top_k]
+            of_racing = scores[not final.has_control : 1 + final.top_k]
+            chosen = choose(of_racing, min_seeds=final.min_seeds, mean_seeds=final.mean_seeds)
             row |= {name: racing[chosen.place].truth - best, f"{name}_trainings": chosen.n_trainings}
         return row
 

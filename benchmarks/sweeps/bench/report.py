@@ -14,7 +14,7 @@ from benchmarks.sweeps.bench.importance import Key, keys_of
 from benchmarks.sweeps.bench.picture import draw
 from benchmarks.sweeps.bench.power import needed_seeds, power_of, residuals_of_good_configs
 from benchmarks.sweeps.bench.races import FIXED, N_SEEDS, RACES, Choices, Comparison, candidates_of, choices_of, compare
-from benchmarks.sweeps.bench.ranking import SAMPLERS, ranked, rules, studies_of
+from benchmarks.sweeps.bench.ranking import FINALS, SAMPLERS, ranked, rules, studies_of
 from benchmarks.sweeps.bench.replay import DEFAULT
 from benchmarks.sweeps.bench.surrogate import Surrogate, fit_of
 from benchmarks.sweeps.bench.table import Curves
@@ -147,8 +147,9 @@ def _print_ranks(ranks: pd.DataFrame) -> None:
             with_interval((row.regret, row.low, row.high)),
             f"{row.fixed:.3f}",
             f"{row.control:.3f}",
+            f"{row.eight:.3f}",
             f"{row.search:.3f}",
-            f"{row.race_trainings:.1f}, {row.fixed_trainings:.0f}",
+            ", ".join(f"{getattr(row, f'{name}_trainings'):.1f}" for name in FINALS),
             f"{row.n_trials:.0f}",
             with_interval((row.better, row.better_low, row.better_high), ".2f"),
             row.n_studies,
@@ -160,8 +161,9 @@ def _print_ranks(ranks: pd.DataFrame) -> None:
         "regret, race",
         "fixed",
         "race with the control",
+        "eight candidates and the control",
         "search alone",
-        "trainings: race, fixed",
+        "trainings: fixed, race, with the control, eight",
         "trials",
     ]
     print(f"\n{markdown([*head, 'better than random, none', 'studies'], rows)}", flush=True)
