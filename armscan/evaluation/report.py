@@ -102,8 +102,8 @@ class EvaluationReport:
             "intervals": {
                 "level": LEVEL,
                 "resamples": N_RESAMPLES,
-                "method": "percentile bootstrap of volumes, then episodes; rates of 0 and 1: Wilson; "
-                f"{ABOVE_RANDOM}: Student's t over volumes, or Newcombe",
+                "method": "percentile bootstrap of subjects, then episodes; rates of 0 and 1: Wilson; "
+                f"{ABOVE_RANDOM}: Student's t over subjects, or Newcombe",
             },
             "splits": {label: _plain(metrics) for label, metrics in self.by_split.items()},
             "volumes": {
@@ -185,6 +185,7 @@ def _cell(estimate: Estimate, form: str, *, apart: str) -> str:
 def _plain(metrics: MetricEstimates) -> dict[str, Any]:
     return {
         "volumes": metrics.n_volumes,
+        "subjects": metrics.n_subjects,
         "episodes": metrics.n_episodes,
         "episodes_started_solved": metrics.n_started_solved,
         "figures": {

@@ -40,7 +40,7 @@ def _on_folds(groups: Sequence[Group]) -> Iterator[str]:
         n_folds = f"{len(tested)} of {planned}" if planned.isdecimal() else str(len(tested))
         yield (
             f"Group {group.number} is a cross-validation: the figures on the test volumes are over {n_folds} folds, "
-            "each volume tested on by trainings that have not seen it, and intervals draw volumes. In learning curves "
+            "each volume tested on by trainings that have not seen it, and intervals draw subjects. In learning curves "
             "each fold of a seed is a line."
         )
         if left_out := ", ".join(sorted(str(fold) for fold in folds - tested)):

@@ -67,7 +67,7 @@ def _rules_of(rules: Rules) -> str | None:
     parts = (rules.reward, *rules.tissues, *([rules.transform] if rules.transform else []))
     if not all(type(part).__module__.startswith("armscan.") for part in parts):
         return None
-    prints = [(name, volume.fingerprint) for name, volume in rules.volumes.items()]
+    prints = [(name, volume.subject, volume.fingerprint) for name, volume in rules.volumes.items()]
     shared = (rules.action_names, rules.success_threshold, rules.ends, rules.max_steps, rules.start, rules.bounds)
     return repr((prints, shared, rules.tissues, rules.transform, type(rules.reward), vars(rules.reward), _sources()))
 

@@ -71,6 +71,14 @@ def test_other_episodes_or_volumes_are_played_anew(volumes, played):
     assert len(played) == 8
 
 
+def test_volume_of_another_subject_is_played_anew(volumes, played):
+    ((name, volume),) = volumes.items()
+    for subject in (None, "S1"):
+        env = EnvFactory(max_steps=3).make_env({name: volume.of_subject(subject)})
+        assert evaluate_baselines(env, n_episodes=1, seed=0)["random"].subject_of == {name: subject or name}
+    assert len(played) == 4
+
+
 def test_rules_of_others_are_never_kept(volumes, played):
     class Mine(LandmarkReward):
         pass
