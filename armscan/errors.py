@@ -11,6 +11,8 @@ import sys
 import textwrap
 from collections.abc import Iterable
 
+# Maximum length of a library's error text in a message.
+MAX_REASON_CHARS = 300
 # Control characters, line separators, bidirectional formatting characters and lone surrogates.
 CONTROLS = re.compile("[\x00-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 
@@ -119,6 +121,16 @@ def is_interruption(error: BaseException | None) -> bool:
             return True
         error = error.__cause__ or error.__context__
     return False
+
+
+def in_one_line(text: object) -> str:
+    """Return a text in one line, with single spaces."""
+    return " ".join(str(text).split())
+
+
+def reason_of(error: BaseException) -> str:
+    """Return the text of an error in one line, of at most `MAX_REASON_CHARS` characters; its `repr` if it has none."""
+    return (in_one_line(error) or repr(error))[:MAX_REASON_CHARS]
 
 
 def listed(allowed: Iterable[object]) -> str:

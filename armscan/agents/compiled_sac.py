@@ -108,9 +108,9 @@ class CompiledSAC(sac.SAC[Any]):
             gradient_steps=n_updates,
         )
 
-    def _agent(self) -> kernels.Agent:
+    def _agent(self) -> kernels.SACState:
         actor, critic, critic2 = self._adams
-        return kernels.Agent(
+        return kernels.SACState(
             actor.weights,
             (critic.weights, critic2.weights),
             self._targets,

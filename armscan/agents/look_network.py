@@ -23,7 +23,7 @@ MIN_EXPECTED = 0.01
 KERNELS = (5, 3, 3)
 
 
-class Estimate(NamedTuple):
+class PlaneEstimate(NamedTuple):
     """Estimate of the labelled plane, from the latest looks of n episodes.
 
     Attributes:
@@ -40,7 +40,7 @@ class Estimate(NamedTuple):
     step: Tensor
     hidden: Tensor
 
-    def moved(self, offsets: Tensor) -> Estimate:
+    def moved(self, offsets: Tensor) -> PlaneEstimate:
         """Return the estimate with its place moved by `offsets`, in the frame of the latest look."""
         return self._replace(place=self.place + offsets)
 
@@ -60,7 +60,7 @@ class PlaneModule(Protocol):
     def calibration(self) -> Tensor:
         """Calibration factors of the expected errors in mm and in degrees, shape (2,)."""
 
-    def estimate(self, observations: dict[str, Tensor]) -> Estimate:
+    def estimate(self, observations: dict[str, Tensor]) -> PlaneEstimate:
         """Return the estimate at the latest look, from observations with parts of shape (n, n_looks, ...)."""
 
     def __call__(self, observations: dict[str, Tensor]) -> tuple[tuple[Tensor, Tensor], None]:
@@ -192,7 +192,7 @@ class FinderModule(nn.Module):
         """Number of features of an estimate."""
         return self.network.place.in_features + 4 + 2 + len(self.offsets)
 
-    def estimate(self, observations: dict[str, Tensor]) -> Estimate:
+    def estimate(self, observations: dict[str, Tensor]) -> PlaneEstimate:
         """Return the estimate at the latest look, from observations with parts of shape (n, n_looks, ...)."""
         actions = observations[ACTION][:, :, :4]
         n_looks = actions.shape[1]
@@ -205,16 +205,16 @@ class FinderModule(nn.Module):
         planes = self.geometry.planes(actions)
         earlier = self.network.earlier_places(planes, self.geometry)
         place, expected, hidden = self.network(observations[IMAGE], actions[:, -1], step, earlier)
-        return Estimate(planes[:, -1], place, expected * self.calibration, step, hidden)
+        return PlaneEstimate(planes[:, -1], place, expected * self.calibration, step, hidden)
 
-    def found(self, observations: dict[str, Tensor]) -> Estimate:
+    def found(self, observations: dict[str, Tensor]) -> PlaneEstimate:
         """Return the estimate at the latest look, its place averaged over the latest `n_averaged` estimates."""
         n_averaged = self._n_averaged
         if n_averaged == 1:
             return self.estimate(observations)
         every = self.estimate(self._latest(observations))
-        by_look = Estimate(*(part.reshape(n_averaged, -1, part.shape[1]) for part in every))
-        latest = Estimate(*(part[0] for part in by_look))
+        by_look = PlaneEstimate(*(part.reshape(n_averaged, -1, part.shape[1]) for part in every))
+        latest = PlaneEstimate(*(part[0] for part in by_look))
         planes = self.geometry.from_frame(every.plane, every.place, torch.zeros_like(every.place[:, 0]))
         places = self.geometry.seen_from(latest.plane.repeat(n_averaged, 1), planes).reshape(n_averaged, -1, 4)
         # Two components are angles, two are in mm.
@@ -234,7 +234,7 @@ class FinderModule(nn.Module):
             looks.append({name: torch.cat([part[:, :1], part[:, :-1]], dim=1) for name, part in looks[-1].items()})
         return {name: torch.cat([each[name] for each in looks]) for name in (IMAGE, ACTION)}
 
-    def actions(self, estimate: Estimate) -> Tensor:
+    def actions(self, estimate: PlaneEstimate) -> Tensor:
         """Return the next actions, shape (n, n_action)."""
         beside_mm = estimate.step @ self.offsets
         is_last = estimate.step[:, -1] > 0.0

@@ -12,7 +12,7 @@ from gymnasium.vector import VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
-from armscan.agents.look_network import Estimate, FinderModule, looks_of
+from armscan.agents.look_network import FinderModule, PlaneEstimate, looks_of
 from armscan.envs.rules import Observed
 from armscan.envs.vector_env import reset_each
 from armscan.utils.arrays import FloatArray
@@ -38,7 +38,7 @@ class ResidualVectorEnv(VectorWrapper):
         super().__init__(envs)
         self._finder, self._limits, self._draw_volumes = finder, limits, draw_volumes
         self._rng = np.random.default_rng()
-        self._estimate: Estimate | None = None
+        self._estimate: PlaneEstimate | None = None
         self.single_observation_space = feature_space(finder)
         self.single_action_space = spaces.Box(-1.0, 1.0, limits.shape)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)

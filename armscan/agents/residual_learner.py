@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from armscan.agents.finder_parameters import FinderParameters
-from armscan.agents.look_network import Estimate, FinderModule
+from armscan.agents.look_network import FinderModule, PlaneEstimate
 from armscan.agents.plane_finder_learner import PlaneFinderLearner
 from armscan.agents.plane_geometry import PlaneGeometry
 from armscan.agents.protocols import AgentSetup
@@ -52,7 +52,7 @@ class ResidualModule(nn.Module):
         """Calibration factors of the expected errors in mm and in degrees, shape (2,)."""
         return self.finder.calibration
 
-    def estimate(self, observations: dict[str, Tensor]) -> Estimate:
+    def estimate(self, observations: dict[str, Tensor]) -> PlaneEstimate:
         """Return the plane finder's estimate at the latest look."""
         return self.finder.estimate(observations)
 

@@ -61,7 +61,7 @@ class Entropy(NamedTuple):
     target: float
 
 
-class Agent(NamedTuple):
+class SACState(NamedTuple):
     """Networks and settings of SAC; `targets` are the target critics."""
 
     actor: Weights
@@ -142,7 +142,7 @@ def _update_critic(critic: Weights, layers: Layers, adam: Adam, td_targets: Floa
 
 @fast_njit
 def _update_actor(
-    agent: Agent, layers: Layers, critic_layers: Layers, noise: Floats, alpha: np.float32
+    agent: SACState, layers: Layers, critic_layers: Layers, noise: Floats, alpha: np.float32
 ) -> tuple[float, float]:
     """Take a gradient step of the actor; return its loss, and the mean log-probability of its actions."""
     n, n_action = noise.shape
@@ -212,7 +212,7 @@ def _td_targets(
     index: Ints,
     obs_next: Floats,
     drawn: Drawn,
-    agent: Agent,
+    agent: SACState,
     layers: Layers,
     alpha: np.float32,
 ) -> Floats:
@@ -241,7 +241,7 @@ def update(
     transitions: Transitions,
     indices: Ints,
     noise: Floats,
-    agent: Agent,
+    agent: SACState,
     actor_layers: Layers,
     critic_layers: Layers,
     losses: FloatArray,

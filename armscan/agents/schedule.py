@@ -11,7 +11,7 @@ from armscan.agents.protocols import Algorithm
 from armscan.errors import InvalidValueError, listed
 from armscan.utils.validation import check_int
 
-FROM, AGENT = "from_env_steps", "agent."
+KEY, FROM, AGENT = "training.schedule", "from_env_steps", "agent."
 
 
 @dataclass(frozen=True)
@@ -27,11 +27,10 @@ class Segment:
     values: Mapping[str, Any]
 
 
-def read_schedule(where: str, described: Any, total_env_steps: int) -> tuple[Segment, ...]:
+def read_schedule(described: Any, total_env_steps: int) -> tuple[Segment, ...]:
     """Return the segments of a schedule.
 
     Args:
-        where: Configuration key of the schedule, for messages.
         described: Mappings such as `{from_env_steps: 4000, agent.lr: 0.001}`, in order; None for no change.
         total_env_steps: Budget of the training, in environment steps; each segment begins before it.
 
@@ -42,11 +41,11 @@ def read_schedule(where: str, described: Any, total_env_steps: int) -> tuple[Seg
         return ()
     if not isinstance(described, list | tuple) or not all(isinstance(each, Mapping) for each in described):
         raise InvalidValueError(
-            f"{where} is {described!r}, but it must be null or a list such as [{{{FROM}: 4000, agent.lr: 0.001}}]"
+            f"{KEY} is {described!r}, but it must be null or a list such as [{{{FROM}: 4000, agent.lr: 0.001}}]"
         )
     segments: list[Segment] = []
     for number, each in enumerate(described):
-        of_each, after = f"{where}[{number}]", segments[-1].from_env_steps if segments else 0
+        of_each, after = f"{KEY}[{number}]", segments[-1].from_env_steps if segments else 0
         start = check_int(f"{of_each}.{FROM}", each.get(FROM), at_least=after + 1, at_most=total_env_steps - 1)
         if wrong := [key for key in each if key != FROM and not str(key).startswith(AGENT)]:
             raise InvalidValueError(f"there is no key {wrong[0]!r} in {of_each}, but only {FROM} and keys of agent")
@@ -68,13 +67,13 @@ def scheduled_algorithms(algorithm: Algorithm, schedule: Sequence[Segment]) -> l
         if wrong := [name for name in segment.values if name not in allowed]:
             keys = listed([f"{AGENT}{name}" for name in allowed]) if allowed else "nothing"
             raise InvalidValueError(
-                f"training.schedule[{number}] changes {AGENT}{wrong[0]}, but during a training of "
+                f"{KEY}[{number}] changes {AGENT}{wrong[0]}, but during a training of "
                 f"{type(algorithm).__name__} only this can change: {keys}"
             )
         pretraining = getattr(algorithm, "pretraining_env_steps", None)
         if pretraining is not None and segment.from_env_steps >= pretraining:
             raise InvalidValueError(
-                f"training.schedule[{number}].{FROM} is {segment.from_env_steps}, but it must be below "
+                f"{KEY}[{number}].{FROM} is {segment.from_env_steps}, but it must be below "
                 f"agent.pretraining_env_steps = {pretraining}: only the pretraining has a schedule"
             )
         changing: Any = algorithm

@@ -7,20 +7,18 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from textwrap import shorten
 from typing import TYPE_CHECKING
 
 import torch
 
 from armscan.agents.policy import Batch, Policy
-from armscan.errors import ExportError, is_interruption
+from armscan.errors import ExportError, is_interruption, reason_of
 
 if TYPE_CHECKING:
     from torch.export import ExportedProgram
 
 # Names of the input, if the observation is one vector, and of the output; an input may already be called `action`.
 OBSERVATION, NEXT_ACTION = "observation", "next_action"
-MAX_REASON_CHARS = 300
 
 
 def export_program(policy: Policy, batch: Batch) -> ExportedProgram:
@@ -82,5 +80,4 @@ def _quietly(what: str) -> Iterator[None]:
     except Exception as error:
         if is_interruption(error):
             raise
-        reason = shorten(str(error) or repr(error), MAX_REASON_CHARS)
-        raise ExportError(f"{what} cannot take the agent's network: {reason}") from error
+        raise ExportError(f"{what} cannot take the agent's network: {reason_of(error)}") from error

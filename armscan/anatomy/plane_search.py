@@ -88,13 +88,13 @@ class PlaneGrid:
         pose: FloatArray = self.lowest + index * self.steps
         return pose
 
-    def rewards(self, judge: PlaneScorer) -> FloatArray:
+    def rewards(self, scorer: PlaneScorer) -> FloatArray:
         """Return the reward of each plane; -1 if its origin cannot lie within the volume."""
         rewards = np.full(self.shape, -1.0)
         for index in np.ndindex(self.shape):
-            plane = plane_at(judge.volume, self.pose(np.array(index)))
+            plane = plane_at(scorer.volume, self.pose(np.array(index)))
             if plane is not None:
-                rewards[index], _ = judge.seen(plane)
+                rewards[index], _ = scorer.score(plane)
         return rewards
 
 
@@ -106,7 +106,7 @@ class PlaneScorer:
         self._reward = reward
         self._scanner = Scanner([volume], tissues)
 
-    def seen(self, plane: ManipulatorAction) -> tuple[float, tuple[int, int, int]]:
+    def score(self, plane: ManipulatorAction) -> tuple[float, tuple[int, int, int]]:
         """Return the reward of a plane and the clusters of bones, tendons and artery that it shows."""
         _, landmarks = self._scanner.look(0, plane)
         bones, tendons, artery = (int(count) for count in landmarks[:, 0])
@@ -149,7 +149,7 @@ def find_optimal_plane(
     """
     if not isinstance(volume, LabelVolume):
         raise InvalidValueError(f"volume is {volume!r}, but it must be a LabelVolume")
-    judge = PlaneScorer(volume, LandmarkReward(targets), check_tissues(clustering))
+    scorer = PlaneScorer(volume, LandmarkReward(targets), check_tissues(clustering))
     check_float("success_threshold", success_threshold, above=0.0, at_most=1.0)
     rz, rx = (
         check_float(name, limit, at_least=0.0, at_most=MAX_ANGLE_DEG)
@@ -159,22 +159,22 @@ def find_optimal_plane(
     last_mm = 2 * volume.centre_mm[1]
 
     coarse = PlaneGrid.between(np.array([-rz, -rx, 0.0]), np.array([rz, rx, last_mm]), np.array([turn, turn, shift]))
-    rewards = coarse.rewards(judge)
+    rewards = coarse.rewards(scorer)
     if rewards.max() <= -success_threshold:
         raise OptimalPlaneError(
             f"{volume.name}: no plane of {rewards.size} scores above -success_threshold = {-success_threshold:g}; "
             f"the best score found is {rewards.max():.3f}"
         )
     fine = coarse.finer_about(largest_best_region(rewards))
-    fine_rewards = fine.rewards(judge)
+    fine_rewards = fine.rewards(scorer)
     region = largest_best_region(fine_rewards)
 
     # The middle of a region that is not convex can lie outside it: then its nearest plane is taken.
     middle = region.mean(axis=0)
     nearest = region[np.linalg.norm(region - middle, axis=1).argmin()]
     planes = [plane for index in (middle, nearest) if (plane := plane_at(volume, fine.pose(index))) is not None]
-    plane = max(planes, key=lambda plane: judge.seen(plane)[0] >= fine_rewards.max() - SAME_REWARD)
-    score, counts = judge.seen(plane)
+    plane = max(planes, key=lambda plane: scorer.score(plane)[0] >= fine_rewards.max() - SAME_REWARD)
+    score, counts = scorer.score(plane)
     spread_rz, spread_rx, spread_along = (float(width) for width in np.ptp(region, axis=0) * fine.steps)
     return FoundPlane(plane, score, counts, (spread_rz, spread_rx, spread_along))
 

@@ -48,65 +48,65 @@ class LabellingOptions:
     volume: str | None = None
 
 
-def label(request: LabellingOptions) -> tuple[list[tuple[LabelVolume, FoundPlane]], list[OptimalPlaneError]]:
+def label(options: LabellingOptions) -> tuple[list[tuple[LabelVolume, FoundPlane]], list[OptimalPlaneError]]:
     """Find or read a plane for each volume, draw it and write it into the manifest, volume by volume.
 
     Returns:
         The volumes, with the plane that each had before, and their planes now in the manifest; and an error for each
         volume in which no plane was found.
     """
-    dataset = open_dataset(request.data, require_manifest=False)
-    volumes = _wanted(request, dataset)
-    if request.markups and request.markup is None:
-        _write_known_markups(request, dataset.volumes, set(volumes))
+    dataset = open_dataset(options.data, require_manifest=False)
+    volumes = _wanted(options, dataset)
+    if options.markups and options.markup is None:
+        _write_known_markups(options, dataset.volumes, set(volumes))
     labelled: list[tuple[LabelVolume, FoundPlane]] = []
     failures: list[OptimalPlaneError] = []
     for number, (name, volume) in enumerate(volumes.items(), 1):
         print(f"{number}/{len(volumes)}  {name}", flush=True)
         try:
-            if request.markup is not None:
-                plane = _drawn(request.markup, volume, request.tissues)
+            if options.markup is not None:
+                plane = _drawn(options.markup, volume, options.tissues)
             else:
-                plane = find_optimal_plane(volume, success_threshold=SUCCESS_THRESHOLD, clustering=request.tissues)
+                plane = find_optimal_plane(volume, success_threshold=SUCCESS_THRESHOLD, clustering=options.tissues)
         except OptimalPlaneError as error:
             failures.append(error)
             continue
         # The manifest last: no plane is written into it without a picture.
-        _make_folder(request.pictures)
-        _write_picture(request.pictures / f"{name}.png", volume, plane.action, request.tissues)
-        if request.markups:
-            write_markup(request.pictures / f"{name}{MARKUP_SUFFIX}", volume, plane.action)
-        record_planes(request.data, {name: (plane.action, plane.score)})
+        _make_folder(options.pictures)
+        _write_picture(options.pictures / f"{name}.png", volume, plane.action, options.tissues)
+        if options.markups:
+            write_markup(options.pictures / f"{name}{MARKUP_SUFFIX}", volume, plane.action)
+        record_planes(options.data, {name: (plane.action, plane.score)})
         labelled.append((volume, plane))
     return labelled, failures
 
 
-def _wanted(request: LabellingOptions, dataset: Dataset) -> dict[str, LabelVolume]:
+def _wanted(options: LabellingOptions, dataset: Dataset) -> dict[str, LabelVolume]:
     """Return the volumes to label, by file name."""
-    names = (request.volume,) if request.volume is not None else request.volumes
+    names = (options.volume,) if options.volume is not None else options.volumes
     if names is None:
         wanted = dataset.volumes
     else:
         if unknown := [name for name in names if name not in dataset.volumes]:
             raise InvalidValueError(f"the volume is {unknown[0]!r}, but it must be {listed(dataset.volumes)}")
         wanted = {name: dataset.volumes[name] for name in names}
-    if request.overwrite or request.markup is not None:
+    if options.overwrite or options.markup is not None:
         return wanted
     return {name: volume for name, volume in wanted.items() if volume.optimal_action is None}
 
 
 def _drawn(markup: Path, volume: LabelVolume, tissues: Tissues) -> FoundPlane:
     action = read_markup(markup, volume)
-    return FoundPlane(action, *PlaneScorer(volume, LandmarkReward(), tissues).seen(action))
+    return FoundPlane(action, *PlaneScorer(volume, LandmarkReward(), tissues).score(action))
 
 
-def _write_known_markups(request: LabellingOptions, volumes: dict[str, LabelVolume], to_label: set[str]) -> None:
+def _write_known_markups(options: LabellingOptions, volumes: dict[str, LabelVolume], to_label: set[str]) -> None:
     """Write the existing planes that are not searched for again, so that they can be corrected too."""
     for name, volume in volumes.items():
-        is_asked_for = request.volumes is None or name in request.volumes
+        is_asked_for = options.volumes is None or name in options.volumes
         if is_asked_for and name not in to_label and volume.optimal_action is not None:
-            _make_folder(request.pictures)
-            write_markup(request.pictures / f"{name}{MARKUP_SUFFIX}", volume, volume.optimal_action)
+            _make_folder(options.pictures)
+            write_markup(options.pictures / f"{name}{MARKUP_SUFFIX}", volume, volume.optimal_action)
 
 
 def _make_folder(folder: Path) -> None:

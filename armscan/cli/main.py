@@ -14,7 +14,7 @@ from armscan.cli.policy import policy
 from armscan.cli.report import report
 from armscan.cli.runs import runs
 from armscan.cli.ui import ui
-from armscan.errors import is_interruption, print_error
+from armscan.errors import in_one_line, is_interruption, print_error
 from armscan.utils.log import silence_libraries
 from armscan.utils.processes import collect_garbage_rarely
 
@@ -75,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(error.format_message(), file=sys.stderr)
         return error.exit_code
     except click.ClickException as error:
-        print_error(" ".join(error.format_message().split()))
+        print_error(in_one_line(error.format_message()))
         return error.exit_code
     except Exception as error:
         if is_interruption(error):

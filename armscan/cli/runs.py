@@ -123,17 +123,17 @@ def prune(what: str, apply: bool, tracking: str, sort: str, limit: int | None, *
     from armscan.runs.prune import plan, remove_planned
     from armscan.runs.query import find
     from armscan.runs.rows import RunRow, sort_rows
-    from armscan.runs.tables import print_plan
+    from armscan.runs.tables import print_prune_plan
 
     with _open(tracking) as client:
         rows = [RunRow(client, run) for run in find(client, **selected)]
-        cases = plan(client, [row.run for row in sort_rows(rows, sort, limit)], what)
+        items = plan(client, [row.run for row in sort_rows(rows, sort, limit)], what)
         if apply:
-            return remove_planned(client, cases, what)
-        print_plan(cases)
-    taken = [case for case in cases if case.left is None]
-    freed = decimal(sum(case.n_bytes for case in taken))
-    print(f"{what} of {len(taken)} of {len(cases)} runs would be removed, {freed}; nothing was removed")
+            return remove_planned(client, items, what)
+        print_prune_plan(items)
+    taken = [item for item in items if item.left is None]
+    freed = decimal(sum(item.n_bytes for item in taken))
+    print(f"{what} of {len(taken)} of {len(items)} runs would be removed, {freed}; nothing was removed")
     if taken:
         print(f"remove it {armscan_command(*click.get_current_context().obj, '--apply')}")
     return 0
@@ -227,6 +227,7 @@ def reproduce(run: str, dry_run: bool, out: Path | None, tracking: str, trust: b
     # As in `armscan run`.
     limit_threads()
     from armscan.runs import reproduce as reproduction
+    from armscan.utils.run_files import ID_CHARS
 
     original = reproduction.load_original(tracking, run, trust=trust)
     differences = reproduction.differences(original)
@@ -237,7 +238,7 @@ def reproduce(run: str, dry_run: bool, out: Path | None, tracking: str, trust: b
         print("code, packages, machine and volumes are unchanged")
     if dry_run:
         return 1 if differences else 0
-    folder = out or REPRODUCTIONS / f"{original.run.run_id[:8]}-{datetime.now():%Y-%m-%d_%H-%M-%S}"
+    folder = out or REPRODUCTIONS / f"{original.run.run_id[:ID_CHARS]}-{datetime.now():%Y-%m-%d_%H-%M-%S}"
     comparison = reproduction.reproduce(original, folder, differences)
     print(*map(printable, comparison.lines()), sep="\n")
     return 0 if comparison.is_same else 1

@@ -35,7 +35,7 @@ from armscan.config.sources import (
     replaced_files,
     sweeps_folder,
 )
-from armscan.errors import InvalidValueError
+from armscan.errors import InvalidValueError, few
 
 T = TypeVar("T")
 VERSION_BASE = "1.3"
@@ -88,8 +88,7 @@ class OwnFolders(SearchPathPlugin):
 def _print_replaced(names: tuple[str, ...]) -> None:
     """Print once which of armscan's own files are not used."""
     if names:
-        more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
-        print(f"using {', '.join(names[:MAX_NAMED])}{more} instead of armscan's own", file=sys.stderr)
+        print(f"using {few(names, MAX_NAMED)} instead of armscan's own", file=sys.stderr)
 
 
 @functools.cache

@@ -17,7 +17,7 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 from yaml import YAMLError
 
 from armscan.config.legacy import rename_hint
-from armscan.errors import ArmscanError, listed, print_error
+from armscan.errors import ArmscanError, in_one_line, listed, print_error
 from armscan.utils.files import FULL_DISK
 
 TRACEBACKS = "ARMSCAN_TRACEBACKS"
@@ -34,7 +34,7 @@ def print_mistake(error: BaseException) -> bool:
 
 def one_line_message(error: BaseException) -> str | None:
     """Return a user's mistake and the allowed values in one line; None if the error is not a user's mistake."""
-    text = " ".join(str(error).split())
+    text = in_one_line(error)
     if (ours := _armscan_error(error)) is not None:
         return _named(str(ours), text.rpartition("full_key: ")[2])
     match error:

@@ -100,8 +100,8 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
             if one_seed is not None and i in chosen:
                 self._rngs[i] = seeding.np_random(one_seed)[0]
         self._begin(chosen, names)
-        look(self.rules, [self._episode(int(i)) for i in chosen])
-        episodes = [self._episode(i) for i in range(self.num_envs)]
+        look(self.rules, self.episodes(chosen))
+        episodes = self.episodes(range(self.num_envs))
         return self._observed(episodes), self._infos(episodes, mask)
 
     def step(self, actions: Any, env_ids: Sequence[int] | EnvIds | None = None) -> VectorStep:
@@ -113,18 +113,19 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
                 order, and other environments do not change. Default: None, all environments.
         """
         chosen = np.arange(self.num_envs) if env_ids is None else self._checked_ids(env_ids)
-        episodes = [self._episode(int(i)) for i in chosen]
+        episodes = self.episodes(chosen)
         is_over = np.array([not episode.is_running for episode in episodes])
         if self._autoreset_mode is AutoresetMode.DISABLED and is_over.any():
             raise ResetNeededError(
                 f"the episodes of environments {chosen[is_over].tolist()} have ended: reset them by "
                 "reset(options={'reset_mask': mask}) before step()"
             )
-        for episode, action in zip(episodes, check_actions(actions, self._action_shape(len(chosen))), strict=True):
+        shape = (len(chosen), *self.rules.action_space.shape)
+        for episode, action in zip(episodes, check_actions(actions, shape), strict=True):
             if episode.is_running:
                 episode.aim(action)
         self._begin(chosen[is_over], [None] * self.num_envs)
-        episodes = [self._episode(int(i)) for i in chosen]
+        episodes = self.episodes(chosen)
         look(self.rules, episodes)
         rewards = np.array([0.0 if over else e.view.reward for e, over in zip(episodes, is_over, strict=True)])
         terminated = np.array([episode.is_terminated for episode in episodes]) & ~is_over
@@ -148,9 +149,6 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
         optima = np.ones((self.num_envs, len(self.rules.action_names)))
         optima[:, : len(free)] = [self._episode(i).scene.optimum_normalised[free] for i in range(self.num_envs)]
         return optima
-
-    def _action_shape(self, n_chosen: int) -> tuple[int, ...]:
-        return (n_chosen, *self.rules.action_space.shape)
 
     def _episode(self, i: int) -> Episode:
         episode = self._episodes[i]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from armscan.errors import DisplayError
+from armscan.errors import DisplayError, reason_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -85,7 +85,7 @@ def opened(title: str, picture: NDArray[np.uint8], height_below: int = 0) -> tup
             figure = pyplot.figure(figsize=size, dpi=DPI, facecolor=picture[0, 0] / 255)
     # Without a display each backend raises its own exception: Tk's TclError derives from Exception alone.
     except Exception as error:
-        raise _no_display(" ".join(str(error).split())) from error
+        raise _no_display(reason_of(error)) from error
     if figure.canvas.manager is not None:
         figure.canvas.manager.set_window_title(title)
     axes = figure.add_axes((0.0, height_below / (height + height_below), 1.0, height / (height + height_below)))
@@ -102,7 +102,7 @@ def check_display() -> None:
         backend = str(pyplot.get_backend())
         pyplot.switch_backend(backend)
     except (ImportError, ValueError) as error:
-        raise _no_display(" ".join(str(error).split())) from error
+        raise _no_display(reason_of(error)) from error
     if any(still in backend.lower().split(".")[-1].split("_") for still in STILL_BACKENDS):
         raise _no_display(f"Matplotlib's backend is {backend!r}, which shows none")
 

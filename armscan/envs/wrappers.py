@@ -39,12 +39,12 @@ ONLY = np.array([0])
 class _HistoryWrapper(gym.Wrapper[Any, FloatArray, Any, FloatArray], RecordConstructorArgs):
     """A wrapper that adds an episode's history, kept as for a batch of one environment, to the observation."""
 
-    def __init__(self, env: Env, remembered: EpisodeHistory, **arguments: Any) -> None:
+    def __init__(self, env: Env, history: EpisodeHistory, **arguments: Any) -> None:
         RecordConstructorArgs.__init__(self, **arguments)
         gym.Wrapper.__init__(self, env)
         self.arguments = arguments
-        self.remembered = remembered
-        self.observation_space = space_of(remembered.boxes)
+        self.history = history
+        self.observation_space = space_of(history.boxes)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -52,18 +52,18 @@ class _HistoryWrapper(gym.Wrapper[Any, FloatArray, Any, FloatArray], RecordConst
         """Start an episode."""
         observation, info = self.env.reset(seed=seed, options=options)
         parts = _batch_of_one(observation)
-        self.remembered.refill(parts, info, ONLY)
+        self.history.refill(parts, info, ONLY)
         return self._with_memory(parts), info
 
     def step(self, action: FloatArray) -> tuple[Observed, float, bool, bool, dict[str, Any]]:
         """Take a step."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         parts = _batch_of_one(observation)
-        self.remembered.push(parts, info, ONLY)
+        self.history.push(parts, info, ONLY)
         return self._with_memory(parts), float(reward), terminated, truncated, info
 
     def _with_memory(self, parts: dict[str, Any]) -> Observed:
-        return observation_of({name: part[0] for name, part in self.remembered.added_to(parts, ONLY).items()})
+        return observation_of({name: part[0] for name, part in self.history.added_to(parts, ONLY).items()})
 
 
 class FrameStack(_HistoryWrapper):
@@ -103,18 +103,18 @@ class BestActionMemory(_HistoryWrapper):
         super().__init__(env, BestPairs(boxes, memory, env.action_space, 1), memory=memory)
 
 
-class _VectorRemembering(VectorWrapper):
+class _VectorHistoryWrapper(VectorWrapper):
     """A wrapper that adds each episode's history to its observations."""
 
-    def __init__(self, env: VectorEnv[Any, Any, Any], remembered: EpisodeHistory) -> None:
+    def __init__(self, env: VectorEnv[Any, Any, Any], history: EpisodeHistory) -> None:
         if env.metadata.get("autoreset_mode") is AutoresetMode.SAME_STEP:
             raise InvalidValueError(
                 f"{type(self).__name__} wraps environments that reset at the next step or not by themselves, but these "
                 "reset in the same step, when the last observation is no longer the episode's"
             )
         super().__init__(env)
-        self.remembered = remembered
-        self.single_observation_space = space_of(remembered.boxes)
+        self.history = history
+        self.single_observation_space = space_of(history.boxes)
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
         self._has_ended = np.zeros(env.num_envs, dtype=np.bool_)
 
@@ -126,25 +126,25 @@ class _VectorRemembering(VectorWrapper):
         parts, first = parts_of(observations), np.flatnonzero(infos["_reward"])
         self._has_ended[first] = False
         self._refill(parts, infos, first, first)
-        return observation_of(self.remembered.added_to(parts, np.arange(self.num_envs))), infos
+        return observation_of(self.history.added_to(parts, np.arange(self.num_envs))), infos
 
     def step(self, actions: Any, env_ids: Sequence[int] | EnvIds | None = None) -> VectorStep:
         """Take a step in every environment, or in those of `env_ids`; see `ArmscanVectorEnv.step`."""
         observations, rewards, terminated, truncated, infos = step_each(self.env, actions, env_ids)
         ids = np.arange(self.num_envs) if env_ids is None else np.asarray(env_ids)
         parts, begun = parts_of(observations), np.flatnonzero(self._has_ended[ids])
-        self.remembered.push(parts, infos, ids)
+        self.history.push(parts, infos, ids)
         if len(begun):
             self._refill(parts, infos, begun, ids[begun])
         self._has_ended[ids] = terminated | truncated
-        return observation_of(self.remembered.added_to(parts, ids)), rewards, terminated, truncated, infos
+        return observation_of(self.history.added_to(parts, ids)), rewards, terminated, truncated, infos
 
     def _refill(self, parts: Parts, infos: Mapping[str, Any], rows: EnvIds, env_ids: EnvIds) -> None:
         firsts = {name: part[rows] for name, part in parts.items()}
-        self.remembered.refill(firsts, {key: infos[key][rows] for key in ("action", "reward") if key in infos}, env_ids)
+        self.history.refill(firsts, {key: infos[key][rows] for key in ("action", "reward") if key in infos}, env_ids)
 
 
-class VectorFrameStack(_VectorRemembering):
+class VectorFrameStack(_VectorHistoryWrapper):
     """`FrameStack` for vector environments, with the same arguments."""
 
     def __init__(self, env: VectorEnv[Any, Any, Any], stack: int, *, exclude: Collection[str] = ()) -> None:
@@ -152,7 +152,7 @@ class VectorFrameStack(_VectorRemembering):
         super().__init__(env, FrameHistory(boxes, stack, exclude, env.num_envs))
 
 
-class VectorBestActionMemory(_VectorRemembering):
+class VectorBestActionMemory(_VectorHistoryWrapper):
     """`BestActionMemory` for vector environments, with the same arguments."""
 
     def __init__(self, env: VectorEnv[Any, Any, Any], memory: int) -> None:

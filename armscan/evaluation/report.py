@@ -16,10 +16,11 @@ from armscan.stats.bootstrap import LEVEL, N_RESAMPLES, Estimate
 from armscan.tracking.sanitize import name_of
 from armscan.training import Evaluation, MetricEstimates, ResultTable
 from armscan.training.baselines import RANDOM
+from armscan.training.episode_results import group_of
 from armscan.training.headline import ABOVE_RANDOM, beside_random, headline
 from armscan.training.metric_display import interval_text
 from armscan.training.metrics import LEAST_SURE, NOT_STARTED_SOLVED, SUREST
-from armscan.utils.rate_text import formatted
+from armscan.utils.text import formatted
 
 TOTAL = "all volumes"
 AGENT = "agent"
@@ -126,14 +127,14 @@ class EvaluationReport:
 
     def metrics(self) -> dict[str, dict[str, float]]:
         """Return the metrics by their origin: `test_volumes`, `volume/NAME`, `BASELINE/test_volumes`."""
-        groups = {label.replace(" ", "_"): metrics.metrics() for label, metrics in self.by_split.items()}
+        groups = {group_of(label): metrics.metrics() for label, metrics in self.by_split.items()}
         for volumes in self.by_volume.values():
             for name, metrics in volumes.items():
                 groups[name_of(f"volume/{name}")] = metrics.metrics()
         shown = {label: [column.metric for column in table.quantities] for label, table in self.tables().items()}
         for name, by_split in self.baselines_by_split.items():
             for label, names in shown.items():
-                groups[f"{name}/{label}".replace(" ", "_")] = by_split[label].shown_metrics(names)
+                groups[group_of(f"{name}/{label}")] = by_split[label].shown_metrics(names)
         return groups
 
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from textwrap import shorten
 
 from armscan.agents import Agent, Learner
 from armscan.anatomy import USUAL_PIXEL_MM
 from armscan.config.command_hints import resume_command
 from armscan.envs import EnvFactory
-from armscan.errors import CheckpointError, InvalidValueError, OptimalPlaneError, listed, printable
+from armscan.errors import CheckpointError, InvalidValueError, OptimalPlaneError, listed, printable, reason_of
 from armscan.evaluation.agent_source import TrainedAgent
 from armscan.evaluation.volumes import (
     TrainingVolumes,
@@ -32,7 +31,6 @@ from armscan.utils.console import print_sentence
 # First seed of an evaluation's episodes, above the seeds of a run's own evaluations.
 FIRST_SEED = 5 * 10**6
 PIXEL_TOLERANCE = 0.1
-MAX_REASON_CHARS = 250
 
 
 @dataclass(frozen=True)
@@ -185,7 +183,7 @@ def _load_weights(agent: Agent, source: TrainedAgent) -> None:
         agent.load_weights(source.weights)
     except CheckpointError as error:
         # torch lists every missing and every unexpected name.
-        raise CheckpointError(f"run {source.run.run_id}: {shorten(str(error), MAX_REASON_CHARS)}") from error
+        raise CheckpointError(f"run {source.run.run_id}: {reason_of(error)}") from error
 
 
 def _without_checkpoint(run: FoundRun) -> str:

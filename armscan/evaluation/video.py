@@ -11,6 +11,7 @@ from armscan.evaluation.runner import FIRST_SEED, PreparedAgent
 from armscan.evaluation.volumes import check_out, data_name, file_name
 from armscan.training import TEST, VideoRecorder, outcome
 from armscan.utils.files import atomic_write
+from armscan.utils.run_files import ID_CHARS
 
 FOLDER = Path("videos")
 SUFFIXES = (".gif", ".mp4")
@@ -31,7 +32,7 @@ def record_video(applied: PreparedAgent, *, n_episodes: int, seed: int, out: Pat
     folder = out or FOLDER
     check_out(folder / "video", folder, "video")
     source = applied.source
-    which = [source.run.run_id[:8]] if source.run else []
+    which = [source.run.run_id[:ID_CHARS]] if source.run else []
     name = file_name("-".join([source.name, data_name(applied.data), *which, f"seed{seed}"]))
     files = [folder / f"{name}{suffix}" for suffix in SUFFIXES]
     with tempfile.TemporaryDirectory() as made_in:

@@ -122,9 +122,7 @@ def set_up(config: DictConfig) -> Experiment:
 
 def build_experiment(config: DictConfig, split: Split | None = None) -> Experiment:
     """Build an experiment from its composed configuration; without `split`, the volumes are read too."""
-    check_words(config)
-    seed = check_seed("seed", config.seed)
-    n_episodes = check_int("evaluation.episodes", config.evaluation.episodes, at_least=1)
+    check_config(config)
     budget = build_section(config, "training", Budget)
     split = split or build_section(config, "data", Split)
     smallest = smallest_slice([*split.training.values(), *split.validation.values(), *split.test.values()])
@@ -134,7 +132,7 @@ def build_experiment(config: DictConfig, split: Split | None = None) -> Experime
         env_factory,
         split.training,
         total_env_steps=budget.env_steps,
-        seed=seed,
+        seed=config.seed,
         validation=split.validation,
         schedule=budget.segments,
     )
@@ -143,15 +141,15 @@ def build_experiment(config: DictConfig, split: Split | None = None) -> Experime
         env_factory=env_factory,
         agent=agent,
         budget=budget,
-        n_episodes=n_episodes,
+        n_episodes=config.evaluation.episodes,
         on_plane=on_plane_of(config),
-        seed=seed,
+        seed=config.seed,
         smallest_slice_px=smallest,
         needs_trust=needs_trust(to_plain(config)),
     )
 
 
-def check_words(config: DictConfig) -> None:
+def check_config(config: DictConfig) -> None:
     """Check all that can be checked before a volume is read or a learning library is loaded.
 
     Raises:

@@ -10,7 +10,7 @@ from rich.text import Text
 from armscan.config.command_hints import STARTED_IN, armscan_command
 from armscan.config.defaults import FOLD
 from armscan.experiment.job import INTERRUPTED, JobOutcome
-from armscan.experiment.results import TITLES, RunResult
+from armscan.experiment.results import TITLES
 from armscan.training import TEST, MetricEstimates, ResultTable
 from armscan.training.baselines import RANDOM
 from armscan.training.headline import headline
@@ -38,11 +38,6 @@ def print_table(title: str, table: ResultTable, notes: Iterable[str] = (), *, ho
         print_sentence(f"note: {note}")
     if table.headline:
         print_sentence(f"result: {table.headline}")
-
-
-def print_results(title: str, reached: RunResult) -> None:
-    """Print the result of a run."""
-    print_table(title, reached.table(), reached.notes())
 
 
 def print_jobs(outcomes: Mapping[str, JobOutcome], run_ids: Mapping[str, str]) -> ResultTable:

@@ -24,11 +24,12 @@ from armscan.training import (
     evaluate_baselines,
 )
 from armscan.training.baselines import RANDOM
+from armscan.training.episode_results import TEST_GROUP, group_of
 from armscan.training.headline import ABOVE_RANDOM, beside_random, headline
+from armscan.training.metric_display import LEADING
 from armscan.utils.files import atomic_write
-from armscan.utils.rate_text import PERCENT, formatted
 from armscan.utils.run_files import BASELINES_FILE, EVALUATION_FILE, RESULTS_PAGE
-from armscan.utils.text import counted
+from armscan.utils.text import PERCENT, counted, formatted
 
 # First seeds of the final evaluations' episodes; those of the baselines do not depend on the seed of the run.
 TRAINING_VOLUMES_SEED, TEST_VOLUMES_SEED = 2 * 10**6, 3 * 10**6
@@ -44,9 +45,7 @@ TITLES = {
 EVALUATED = "/success_rate"
 # Of the metrics of a single volume in an evaluation.
 VOLUME_PREFIX = "volume/"
-NAMES = {name.replace(" ", "_"): name for name in (TEST, TRAINING)} | {"validation": LAST_VALIDATION}
-# Metrics of a run's MLflow model, besides the on-plane rates.
-OF_MODEL = ("median_distance_mm", "median_distance_deg", "success_rate", "mean_steps")
+NAMES = {group_of(name): name for name in (TEST, TRAINING)} | {"validation": LAST_VALIDATION}
 # With fewer wrists intervals are clearly too narrow: docs/metrics.md.
 MIN_WRISTS = 8
 WHAT_HELPS = "more wrists, data=mixed, or cross-validation (data.folds=leave_one_out) would help"
@@ -119,8 +118,8 @@ class RunResult:
 
     def model_metrics(self) -> dict[str, list[str]]:
         """Return the names of the metrics that describe the run's checkpoint, by split."""
-        names = [*(limits.metric for limits in self.evaluations[TEST].on_plane), *OF_MODEL]
-        groups = {"test": TEST.replace(" ", "_"), "validation": "validation"}
+        names = [*(limits.metric for limits in self.evaluations[TEST].on_plane), *LEADING]
+        groups = {"test": TEST_GROUP, "validation": "validation"}
         return {part: [f"{group}/{name}" for name in names] for part, group in groups.items()}
 
     def notes(self) -> list[str]:

@@ -13,6 +13,7 @@ from armscan.config.defaults import FOLD
 from armscan.reports.html import page
 from armscan.training import TEST, Evaluation, MetricEstimates, ResultTable
 from armscan.training.baselines import RANDOM
+from armscan.training.episode_results import TEST_GROUP
 from armscan.training.headline import beside_random, headline
 from armscan.utils.files import atomic_write
 from armscan.utils.run_files import BASELINES_FILE, EVALUATION_FILE, RESULTS_PAGE
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
 SEED = "seed"
 ALL_FOLDS = ", all folds"
 AGENT = f"agent{ALL_FOLDS}"
-TEST_GROUP = TEST.replace(" ", "_")
 
 
 def folds_table(runs: Iterable[tuple[Path, str]]) -> ResultTable | None:

@@ -56,14 +56,14 @@ def check_grid(words: Sequence[str]) -> None:
         return
     print("preparing a grid: its words are checked first", flush=True)
     # Deferred: it takes time, so the line above comes first.
-    from armscan.experiment.build import check_words
+    from armscan.experiment.build import check_config
 
     errors = []
     _, jobs = _jobs_of(overrides)
     for job in jobs:
         config = compose(job)
         try:
-            check_words(config)
+            check_config(config)
         except (ArmscanError, HydraException, OmegaConfBaseException) as error:
             errors.append(error)
         else:

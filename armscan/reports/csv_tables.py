@@ -21,18 +21,13 @@ def all_numbers(
 ) -> dict[str, list[Row]]:
     """Return the tables by file name."""
     return {
-        "runs": run_rows(groups),
+        "runs": [_run_row(group, training) for group in groups for training in group.trainings],
         "curves": list(_curve_rows(groups, curves)),
         "seed_curves": list(_seed_rows(groups)),
         "final": list(_final_rows(groups, reached)),
         "final_by_volume": list(_volume_rows(groups)),
         "improvement": list(_pair_rows(groups, pairs)),
     }
-
-
-def run_rows(groups: Sequence[Group]) -> list[Row]:
-    """Return a row for each compared run."""
-    return [_run_row(group, training) for group in groups for training in group.trainings]
 
 
 def _run_row(group: Group, training: TrackedTraining) -> Row:

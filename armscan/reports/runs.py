@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import re
 import tempfile
@@ -11,6 +10,7 @@ from pathlib import Path
 
 from armscan.reports.select import EXPERIMENT, find_trainings, read_runs
 from armscan.tracking import open_existing_store
+from armscan.utils.files import sha256
 from armscan.utils.run_files import ID_CHARS
 from armscan.utils.text import counted
 
@@ -56,4 +56,4 @@ def compare_runs(text: str, uri: str, out: str | None) -> Path:
 def _folder_name(named: Sequence[str]) -> str:
     labels = [name.removeprefix(EXPERIMENT) if name.startswith(EXPERIMENT) else name[:ID_CHARS] for name in named]
     name = re.sub(r"[^\w.\-]+", "-", "-".join(["runs", *labels]))
-    return name if len(name) <= MAX_NAME_CHARS else f"runs-{hashlib.sha256(name.encode()).hexdigest()[:SUM_CHARS]}"
+    return name if len(name) <= MAX_NAME_CHARS else f"runs-{sha256(name.encode())[:SUM_CHARS]}"

@@ -11,7 +11,7 @@ from rich.text import Text
 
 from armscan.config.command_hints import armscan_command, resume_command
 from armscan.config.trust import TRUST, needs_trust
-from armscan.errors import printable
+from armscan.errors import in_one_line, printable
 from armscan.experiment.results import evaluation_table, figures_of, result_table
 from armscan.runs.rows import RunRow, artifacts_of
 from armscan.runs.run_folder import OwnFolder, RunSkippedError
@@ -75,7 +75,7 @@ def _print_pairs(console: Console, title: str, pairs: dict[str, str], right: str
     table = narrow_table("", right)
     table.show_header = False
     for name, value in pairs.items():
-        whole = " ".join(value.split())
+        whole = in_one_line(value)
         cut = f"{whole[:MAX_VALUE_CHARS]}…" if len(whole) > MAX_VALUE_CHARS and name not in STARTED_BY else whole
         table.add_row(Text(printable(name)), Text(printable(cut)))
     if pairs:

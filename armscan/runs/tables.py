@@ -21,8 +21,8 @@ from armscan.stats.on_plane import ON_PLANE
 from armscan.tracking.tags import AGENT_TAG, FOLDER_TAG, HOST_TAG, OBS_TAG, PARENT_TAG
 from armscan.utils.console import print_table, wide_console
 from armscan.utils.csv_file import write_csv
-from armscan.utils.rate_text import PERCENT, formatted
 from armscan.utils.run_files import ID_CHARS
+from armscan.utils.text import PERCENT, formatted
 
 MISSING = "-"
 # Longest name to show; that of a multirun is its command line.
@@ -127,10 +127,10 @@ def _values(row: RunRow) -> dict[str, Any]:
     return dict(zip(COLUMNS, values, strict=True))
 
 
-def print_plan(cases: Sequence[PruneItem]) -> None:
+def print_prune_plan(items: Sequence[PruneItem]) -> None:
     """Print the files that would be removed, and why the others would stay."""
-    for case in cases:
-        info = case.run.info
-        named = f"{shortened(info.run_name)}, {info.status.lower()}, of {format_start(case.run)}"
-        what = f"frees {decimal(case.n_bytes)}: {named}" if case.left is None else f"stays: {case.left}"
+    for item in items:
+        info = item.run.info
+        named = f"{shortened(info.run_name)}, {info.status.lower()}, of {format_start(item.run)}"
+        what = f"frees {decimal(item.n_bytes)}: {named}" if item.left is None else f"stays: {item.left}"
         wide_console().print(Text(f"{info.run_id[:ID_CHARS]} {what}"), soft_wrap=True)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from armscan.errors import InvalidValueError
-from armscan.stats.bootstrap import LEVEL, Estimate
+from armscan.stats.bootstrap import UPPER, Estimate
 from armscan.stats.paired import crossed_mean
 from armscan.utils.arrays import FloatArray
 
@@ -20,8 +20,6 @@ from armscan.utils.arrays import FloatArray
 MIN_SEEDS = 3
 # Steps of a bisection from 0 to 1, to the last bit.
 N_HALVINGS = 53
-# Quantile at the upper end of an interval.
-UPPER = (1 + LEVEL) / 2
 
 
 class Band(NamedTuple):

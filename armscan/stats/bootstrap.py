@@ -16,7 +16,7 @@ import math
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from functools import cache
 from statistics import NormalDist
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,8 @@ from armscan.errors import InvalidValueError
 from armscan.utils.arrays import FloatArray
 
 LEVEL = 0.95
+# Quantiles at the ends of an interval.
+LOWER, UPPER = (1 - LEVEL) / 2, (1 + LEVEL) / 2
 N_RESAMPLES = 2000
 # Most resampled values in memory at once.
 MAX_VALUES = 2_000_000
@@ -39,10 +41,19 @@ class Estimate(NamedTuple):
     low: float
     high: float
 
+    @classmethod
+    def around(cls, mean: Any, half_width: Any) -> Estimate:
+        """Return a mean with a symmetric interval, which is NaN if `half_width` is."""
+        return cls(float(mean), float(mean - half_width), float(mean + half_width))
+
     def clipped(self, least: float, most: float) -> Estimate:
         """Return the estimate with its interval cut at the bounds of the figure, which Student's interval ignores."""
         low, high = np.clip((self.low, self.high), least, most)
         return Estimate(self.value, float(low), float(high))
+
+
+# Nothing was measured.
+UNKNOWN = Estimate(math.nan, math.nan, math.nan)
 
 
 def mean(samples: FloatArray) -> FloatArray:
@@ -119,9 +130,9 @@ def estimates(
 def wilson(n_successes: int, n_trials: int) -> Estimate:
     """Return a rate with Wilson's interval, as if all trials were independent (Newcombe 1998, method 3)."""
     if n_trials == 0:
-        return Estimate(math.nan, math.nan, math.nan)
+        return UNKNOWN
     # Not from scipy.stats, whose import takes a second.
-    z = NormalDist().inv_cdf((1 + LEVEL) / 2)
+    z = NormalDist().inv_cdf(UPPER)
     rate, whole = n_successes / n_trials, 2 * (n_trials + z**2)
     middle = (2 * n_successes + z**2) / whole
     delta = z / whole * math.sqrt(4 * n_successes * (1 - rate) + z**2)
@@ -148,7 +159,7 @@ def _estimate(value: float, resampled: FloatArray) -> Estimate:
     known = resampled[~np.isnan(resampled)]
     if not len(known):
         return Estimate(value, math.nan, math.nan)
-    low, high = np.quantile(known, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+    low, high = np.quantile(known, [LOWER, UPPER])
     return Estimate(value, float(low), float(high))
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from armscan.errors import InvalidValueError
-from armscan.stats.bootstrap import LEVEL, Estimate
+from armscan.stats.bootstrap import UPPER, Estimate
 from armscan.utils.arrays import FloatArray
 
 
@@ -51,7 +51,7 @@ def mean_over_seeds(scores: FloatArray) -> Estimate:
     """
     mean, half = crossed_mean(scores)
     half = half if len(scores) > 1 else np.nan
-    return Estimate(float(mean), float(mean - half), float(mean + half))
+    return Estimate.around(mean, half)
 
 
 def of_subjects(values: FloatArray, subjects: Sequence[str]) -> FloatArray:
@@ -104,8 +104,8 @@ def crossed_mean(values: FloatArray) -> tuple[Any, Any]:
     terms = seeds**2 / max(1, n_seeds - 1) + np.where(differ, volumes**2 / max(1, n_volumes - 1), 0.0)
     # Without any of these spreads, their degrees of freedom limit nothing.
     df = np.where(terms > 0.0, variances**2 / np.where(terms > 0.0, terms, 1.0), np.inf)
-    halves = stdtrit(df, (1 + LEVEL) / 2) * np.sqrt(variances)
+    halves = stdtrit(df, UPPER) * np.sqrt(variances)
     for mean_square, n in ((seeds, n_seeds), (volumes, n_volumes)):
         if n > 1:
-            halves = np.maximum(halves, stdtrit(n - 1, (1 + LEVEL) / 2) * np.sqrt(mean_square))
+            halves = np.maximum(halves, stdtrit(n - 1, UPPER) * np.sqrt(mean_square))
     return means, halves / np.sqrt(n_seeds * n_volumes)

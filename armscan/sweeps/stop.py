@@ -15,6 +15,7 @@ from armscan.sweeps.storage.attribute_names import LEASE, RUN, STOP, STUDY_RUN
 from armscan.sweeps.storage.attributes import FINAL_SUFFIXES
 from armscan.sweeps.storage.storage import Storage, existing_storage, open_storage
 from armscan.sweeps.study.study import is_ours
+from armscan.utils.text import counted
 
 STOPPED_BY = "at {:%Y-%m-%d %H:%M:%S} by {}"
 
@@ -61,7 +62,7 @@ def stop_study(uri: str, name: str) -> str:
             study.set_user_attr(STOP, reason())
             n_running += len(study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)))
     return (
-        f"study {name}: {n_running} running trial{'' if n_running == 1 else 's'} will be requeued at the next report; "
+        f"study {name}: {counted(n_running, 'running trial')} will be requeued at the next report; "
         "the same command resumes it"
     )
 

@@ -9,7 +9,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from armscan.config.credentials import mask_passwords
-from armscan.errors import TrackingUnavailableError
+from armscan.errors import MAX_REASON_CHARS, TrackingUnavailableError, in_one_line
 from armscan.tracking.sanitize import tags_of
 from armscan.tracking.tags import PARENT_TAG
 from armscan.utils.retry import RetryPolicy
@@ -25,7 +25,6 @@ UNAVAILABLE, NOT_THERE = (
     ("INTERNAL_ERROR", "TEMPORARILY_UNAVAILABLE", "REQUEST_LIMIT_EXCEEDED"),
     "RESOURCE_DOES_NOT_EXIST",
 )
-MAX_REASON_CHARS = 300
 # On a loaded server, a larger page would exceed the request timeout.
 PER_PAGE = 100
 # The informative part of an HTTP client's error message.
@@ -141,7 +140,7 @@ def unavailable_reason(error: BaseException) -> str | None:
 
 def reason_in(error: BaseException) -> str:
     """Return the text of an error, short and without a password."""
-    text = mask_passwords(" ".join(str(error).split()))
+    text = mask_passwords(in_one_line(error))
     if told := SHORT.search(text):
         return next(part for part in told.groups() if part).strip()
     return text[:MAX_REASON_CHARS]

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import posixpath
 import re
 from collections.abc import Mapping
 from typing import Any
 
+from armscan.utils.files import sha256
 from armscan.utils.run_files import CONFIG_FILE
 
 # MLflow's own limits; a store refuses a whole request if one value is longer.
@@ -45,7 +45,7 @@ def name_of(key: str) -> str:
     name = posixpath.normpath(REFUSED.sub("_", key).strip(REFUSED_ENDS).replace("..", "._") or "_")
     if name == key and len(key) <= MAX_KEY_CHARS:
         return key
-    return f"{name[: MAX_KEY_CHARS - N_SUM_CHARS - 1]}-{hashlib.sha256(key.encode()).hexdigest()[:N_SUM_CHARS]}"
+    return f"{name[: MAX_KEY_CHARS - N_SUM_CHARS - 1]}-{sha256(key.encode())[:N_SUM_CHARS]}"
 
 
 def truncate(text: str, at_most: int, whole_in: str) -> str:
@@ -53,6 +53,6 @@ def truncate(text: str, at_most: int, whole_in: str) -> str:
     if len(text) <= at_most:
         return text
     # The checksum distinguishes strings that begin alike.
-    summed = hashlib.sha256(text.encode(errors="surrogatepass")).hexdigest()[:N_SUM_CHARS]
+    summed = sha256(text.encode(errors="surrogatepass"))[:N_SUM_CHARS]
     note = f" ... cut: {whole_in} has all {len(text)} characters ({summed})"
     return text[: at_most - len(note)] + note

@@ -6,7 +6,6 @@ Their episodes are cached on the machine, because many runs have the same volume
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 from dataclasses import asdict
 from functools import cache
@@ -20,7 +19,7 @@ from armscan.envs.rules import Rules
 from armscan.stats.on_plane import ON_PLANE, OnPlane
 from armscan.training.episode_results import Env, Evaluation
 from armscan.training.episodes import evaluate
-from armscan.utils.files import atomic_write, cache_folder
+from armscan.utils.files import atomic_write, cache_folder, sha256
 
 FOLDER = "baselines"
 # Code that determines how the episodes of the baselines go.
@@ -75,14 +74,13 @@ def _rules_of(rules: Rules) -> str | None:
 @cache
 def _sources() -> str:
     """Return the checksum of the code that plays episodes, so that changed code does not reuse old ones."""
-    folder, digest = Path(armscan.__file__).parent, hashlib.sha256()
-    for file in sorted(file for pattern in SOURCES for file in folder.glob(pattern)):
-        digest.update(file.read_bytes())
-    return digest.hexdigest()
+    folder = Path(armscan.__file__).parent
+    files = sorted(file for pattern in SOURCES for file in folder.glob(pattern))
+    return sha256(b"".join(file.read_bytes() for file in files))
 
 
 def _file(name: str, rules: str, n_episodes: int, seed: int) -> Path:
-    digest = hashlib.sha256(repr((name, rules, n_episodes, seed)).encode()).hexdigest()
+    digest = sha256(repr((name, rules, n_episodes, seed)).encode())
     return cache_folder() / FOLDER / f"{digest[:32]}.json"
 
 

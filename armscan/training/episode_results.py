@@ -19,7 +19,6 @@ from armscan.utils.arrays import FloatArray
 
 # Names of evaluations, after their volumes.
 TRAINING, VALIDATION, TEST = "training volumes", "validation volumes", "test volumes"
-
 SUCCESS, DISTANCE = BEST_BY = ("success", "distance")
 
 # Bound on the numbers of an episode, whose sums are then finite.
@@ -38,6 +37,14 @@ MEANS = {
 }
 
 Env = gym.Env[Observed, FloatArray]
+
+
+def group_of(name: str) -> str:
+    """Return the prefix of the tracked metrics of an evaluation, such as `test_volumes`."""
+    return name.replace(" ", "_")
+
+
+TEST_GROUP = group_of(TEST)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,7 +18,7 @@ from armscan.stats.paired import crossed_mean, of_subjects
 from armscan.training.episode_results import Evaluation
 from armscan.training.metric_display import interval_text
 from armscan.training.metrics import MetricEstimates
-from armscan.utils.rate_text import formatted
+from armscan.utils.text import formatted
 
 # Metric of an agent: difference of its leading on-plane rate from random planes'.
 ABOVE_RANDOM = "on_plane_above_random"
@@ -49,7 +49,7 @@ def beside_random(
     subject_of = random.subject_of
     differences = of_subjects(scores - np.array([*theirs.values()]), [subject_of[name] for name in theirs])
     mean, half = crossed_mean(differences)
-    above = Estimate(float(mean), float(mean - half), float(mean + half)).clipped(-1.0, 1.0)
+    above = Estimate.around(mean, half).clipped(-1.0, 1.0)
     if half < NO_WIDTH:
         above = difference_of_rates(_wilson_of(trainings), _wilson_of([random]))
     return replace(figures, estimates={**figures.estimates, ABOVE_RANDOM: above})

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from armscan.stats.bootstrap import Estimate
 from armscan.stats.on_plane import limits_among
-from armscan.utils.rate_text import formatted
+from armscan.utils.text import formatted
 from armscan.volumes.labelmap import LANDMARKS
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from armscan.stats.bootstrap import Estimate, Statistic, estimates, interquartile_mean, mean, quantile, wilson
+from armscan.stats.bootstrap import UNKNOWN, Estimate, Statistic, estimates, interquartile_mean, mean, quantile, wilson
 from armscan.stats.on_plane import OnPlane, limits_among
 from armscan.training.episode_results import MEANS, EpisodeResult, Evaluation
 
@@ -128,7 +128,7 @@ class MetricEstimates:
 
     def estimate(self, name: str) -> Estimate:
         """Return a figure as it is shown: NaN if there is none; with Wilson's interval if its own has no width."""
-        estimate = self.estimates.get(name, Estimate(math.nan, math.nan, math.nan))
+        estimate = self.estimates.get(name, UNKNOWN)
         return self.estimates.get(name + WILSON, estimate) if estimate.low == estimate.high else estimate
 
     def metrics(self) -> dict[str, float]:

@@ -15,7 +15,7 @@ from rich.text import Text
 
 from armscan.training.callbacks import Callback, EpochReport
 from armscan.utils.console import print_sentence
-from armscan.utils.rate_text import PERCENT, formatted
+from armscan.utils.text import PERCENT, formatted
 
 
 def progress_reporter(label: str | None = None, measured: str = "validation") -> Callback:

@@ -18,9 +18,7 @@ from rich.text import Text
 from armscan.stats.bootstrap import Estimate
 from armscan.training.metric_display import LEADING, OLDER, QUANTITIES, Quantity, interval_text
 from armscan.training.metrics import MetricEstimates
-from armscan.utils.markdown import markdown_table
-from armscan.utils.rate_text import formatted
-from armscan.utils.text import counted
+from armscan.utils.text import counted, formatted, markdown_table
 
 # Maximum number of results that are columns side by side; with more, each is a line.
 MAX_ABREAST = 6

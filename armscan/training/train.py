@@ -77,12 +77,12 @@ class Budget:
         check_choice("training.best_by", self.best_by, BEST_BY)
         if self.solved is not None and not isinstance(self.solved, SolvedCriterion):
             raise InvalidValueError(f"training.solved is {self.solved!r}, but it must be a SolvedCriterion or null")
-        read_schedule("training.schedule", self.schedule, self.env_steps)
+        read_schedule(self.schedule, self.env_steps)
 
     @property
     def segments(self) -> tuple[Segment, ...]:
         """The changes of `schedule`, in order."""
-        return read_schedule("training.schedule", self.schedule, self.env_steps)
+        return read_schedule(self.schedule, self.env_steps)
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from armscan.agents.protocols import Agent
 from armscan.envs.panels import INK, font
 from armscan.training.episode_results import Env, EpisodeResult
 from armscan.training.episodes import play
+from armscan.utils.text import counted
 
 FRAME_MS = 600
 LAST_FRAME_MS = 2400
@@ -125,8 +126,8 @@ def _mp4_writer(file: Path, picture: Picture) -> Generator[None, Picture | None,
 def outcome(episode: EpisodeResult) -> str:
     """Return the outcome of an episode as a string."""
     how = "success" if episode.is_success else "no success"
-    steps = "1 step" if episode.n_steps == 1 else f"{episode.n_steps} steps"
-    return f"{how} after {steps}, {episode.distance_mm:.1f} mm and {episode.distance_deg:.1f}° from the optimal plane"
+    off = f"{episode.distance_mm:.1f} mm and {episode.distance_deg:.1f}°"
+    return f"{how} after {counted(episode.n_steps, 'step')}, {off} from the optimal plane"
 
 
 def record_episode(agent: Agent, env: Env, path: Path, *, seed: int) -> None:

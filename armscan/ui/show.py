@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from armscan.config.credentials import TRACKING_PASSWORD, database_url
-from armscan.errors import InvalidValueError, TrackingError, printable
+from armscan.errors import InvalidValueError, TrackingError, printable, reason_of
 from armscan.ui.servers import HOST, check_port, mlflow_server, start_dashboard
 from armscan.utils.files import SQLITE_PREFIX, sqlite_file
 
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 # One of the tables of MLflow.
 RUNS_TABLE = "experiments"
-MAX_REASON_CHARS = 300
 
 
 def show(
@@ -110,5 +109,5 @@ def _has_runs(uri: str) -> bool:
         return RUNS_TABLE in tables_in(database_url(uri, TRACKING_PASSWORD))
     except (SQLAlchemyError, ImportError, OSError, ValueError) as error:
         # The reason, without the statement that failed.
-        reason = " ".join(str(getattr(error, "orig", None) or error).split())[:MAX_REASON_CHARS]
+        reason = reason_of(getattr(error, "orig", None) or error)
         raise TrackingError(f"--tracking is {uri!r}, but this store cannot be used: {reason}") from error

@@ -1,8 +1,30 @@
-"""Numbers of things in sentences."""
+"""Numbers, rates and tables as text."""
 
 from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+# Short form of a rate.
+PERCENT = "{:.0%}"
+
+
+def formatted(form: str, value: float) -> str:
+    """Format a value, for instance by `{:.1%}`; instead of rounding to 0 or 100 %, a rate is `<0.1%` or `>99.9%`."""
+    text = form.format(value)
+    if form.endswith("%}") and 0.0 < value < 1.0:
+        smallest = 10.0 ** -(len(text.partition(".")[2].rstrip("%")) + 2)
+        for bound, sign, nearest in ((0.0, "<", smallest), (1.0, ">", 1.0 - smallest)):
+            if text == form.format(bound):
+                return sign + form.format(nearest)
+    return text
 
 
 def counted(number: int, what: str) -> str:
     """Return a number with its noun, such as `1 seed` or `3 seeds`."""
     return f"{number} {what}{'' if number == 1 else 's'}"
+
+
+def markdown_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table in Markdown; its first column is aligned to the left, the others to the right."""
+    lines = [columns, ["---", *("---:" for _ in columns[1:])], *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)

@@ -15,7 +15,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap
 from yaml.representer import SafeRepresenter
 
-from armscan.errors import InvalidValueError, ManifestError, VolumeError, few, listed
+from armscan.errors import InvalidValueError, ManifestError, VolumeError, few, listed, reason_of
 from armscan.utils.files import atomic_write, cache_folder, sha256
 from armscan.utils.strict_yaml import check_no_duplicates, load_yaml
 from armscan.utils.validation import check_float, check_path
@@ -192,7 +192,7 @@ def _load(path: Path) -> Document:
         raise ManifestError(f"{path}: the manifest cannot be read ({error.strerror or error})") from error
     # On some damaged texts PyYAML raises exceptions of other types: KeyError, AttributeError, ...
     except Exception as error:
-        reason = " ".join(str(error).split())[:300]
+        reason = reason_of(error)
         if isinstance(error, yaml.MarkedYAMLError):
             # Without PyYAML's excerpt of the text.
             mark = error.problem_mark

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from armscan.errors import VolumeError
-from armscan.utils.files import cache_folder
+from armscan.utils.files import cache_folder, sha256
 from armscan.volumes import (
     header_checks,
     labelmap,
@@ -100,13 +100,11 @@ def _digest(path: Path) -> str | None:
 
 
 def _place(kind: str, *depends_on: Any) -> Path:
-    key = hashlib.sha256(repr((_code_version(), depends_on)).encode()).hexdigest()
+    key = sha256(repr((_code_version(), depends_on)).encode())
     return cache_folder() / f"{kind}-{key}{SUFFIX}"
 
 
 @cache
 def _code_version() -> str:
-    digest = hashlib.sha256(repr([version(package) for package in READERS]).encode())
-    for module in CODE:
-        digest.update(Path(str(module.__file__)).read_bytes())
-    return digest.hexdigest()
+    readers = repr([version(package) for package in READERS]).encode()
+    return sha256(readers + b"".join(Path(str(module.__file__)).read_bytes() for module in CODE))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from armscan.errors import InvalidValueError, VolumeError, listed
+from armscan.errors import MAX_REASON_CHARS, InvalidValueError, VolumeError, in_one_line, listed
 from armscan.utils.arrays import FloatArray
 from armscan.utils.validation import check_choice, check_path
 from armscan.volumes.header_checks import CHECKS
@@ -146,7 +146,7 @@ def _read_labels(path: Path, options: ReadingOptions) -> tuple[SimpleITK.Image, 
     except OSError as error:
         raise VolumeError(f"{path}: the file cannot be read ({error.strerror or error})") from error
     except RuntimeError as error:
-        reason = " ".join(str(error).split("ERROR:")[-1].split())[:200]
+        reason = in_one_line(str(error).split("ERROR:")[-1])[:MAX_REASON_CHARS]
         raise VolumeError(f"{path}: the file is truncated or damaged, or no image ({reason})") from error
     if stored.GetDimension() == 4 and stored.GetSize()[3] == 1:
         # A single time point.

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from armscan.errors import VolumeError, listed
+from armscan.errors import VolumeError, listed, reason_of
 from armscan.utils.arrays import FloatArray
 from armscan.volumes.labelmap import BACKGROUND, TISSUE_LABELS, FoundSource, LabelMap, apply_table, count_values, shown
 
@@ -78,8 +78,9 @@ def _contents(path: Path) -> dict[str, Any]:
         contents: dict[str, Any] = slicerio.read_segmentation(str(path))
     # slicerio and pynrrd raise exceptions of many types on a damaged file.
     except Exception as error:
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise VolumeError(f"{path}: the file is truncated or damaged, or no segmentation ({reason})") from error
+        raise VolumeError(
+            f"{path}: the file is truncated or damaged, or no segmentation ({reason_of(error)})"
+        ) from error
     if not contents["segments"]:
         raise VolumeError(f"{path}: the file names no segment (Segment0_Name, ...), but a segmentation needs some")
     return contents

@@ -22,7 +22,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from armscan.stats.aggregation import probability_of_improvement
-from armscan.stats.bootstrap import LEVEL, N_RESAMPLES
+from armscan.stats.bootstrap import LOWER, N_RESAMPLES, UPPER
 from armscan.stats.paired import crossed_mean
 from armscan.sweeps.scheduling.race import MAX_SEEDS_FACTOR, race
 from benchmarks.tables import print_head, print_row
@@ -46,7 +46,7 @@ class Coverage(NamedTuple):
     n_trainings: float
 
 
-def simulate(n_studies: int, n_seeds: int, n_volumes: int, effect: float, *, seed: int = 0) -> Coverage:
+def simulate(n_studies: int, n_seeds: int, n_volumes: int, effect: float) -> Coverage:
     """Simulate studies.
 
     Args:
@@ -54,9 +54,8 @@ def simulate(n_studies: int, n_seeds: int, n_volumes: int, effect: float, *, see
         n_seeds: Seeds of the judgement.
         n_volumes: Test volumes.
         effect: Standard deviation of the true values of the candidates, around that of the control.
-        seed: Seed of the simulation. Default: 0.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     n_configurations = N_CANDIDATES + 1
     true = np.c_[np.zeros(n_studies), effect * rng.standard_normal((n_studies, N_CANDIDATES))]
 
@@ -82,7 +81,7 @@ def simulate(n_studies: int, n_seeds: int, n_volumes: int, effect: float, *, see
         truth = true[study, chosen] - true[study, 0]
         differences = own[study, chosen] - own[study, 0]
         drawn = rng.choice(differences.mean(axis=-1), size=(N_RESAMPLES, n_seeds)).mean(axis=1)
-        low, high = np.quantile(drawn, ((1 - LEVEL) / 2, (1 + LEVEL) / 2))
+        low, high = np.quantile(drawn, (LOWER, UPPER))
         improvement = probability_of_improvement(own[study, chosen], own[study, 0])
         held.append(
             (

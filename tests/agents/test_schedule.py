@@ -121,7 +121,7 @@ def test_learning_rates_are_those_of_the_schedule_and_not_of_the_checkpoint(make
 )
 def test_schedule_answers_mistakes_in_one_line(described, line):
     with pytest.raises(InvalidValueError) as raised:
-        read_schedule("training.schedule", described, 100)
+        read_schedule(described, 100)
     assert str(raised.value).startswith(line)
 
 

@@ -61,27 +61,27 @@ class Scripted(gym.Env):
         return observed, self._reward, False, False, info
 
 
-def remembered(observed):
+def best_pairs(observed):
     return np.round(observed[2:].reshape(-1, 2).astype(float), 6).tolist()
 
 
 def test_memory_keeps_the_best_pairs_best_first_and_the_earlier_of_equals():
     env = BestActionMemory(Scripted([-0.5, -0.75, -0.5, -0.25, -0.25, -0.5]), 3)
     observed, _ = env.reset()
-    assert remembered(observed) == [[0.0, -0.5]] * 3
+    assert best_pairs(observed) == [[0.0, -0.5]] * 3
     # Worse than the worst kept, and as good as it: neither enters.
-    assert remembered(env.step(np.array([0.1]))[0]) == [[0.0, -0.5]] * 3
-    assert remembered(env.step(np.array([0.2]))[0]) == [[0.0, -0.5]] * 3
-    assert remembered(env.step(np.array([0.3]))[0]) == [[0.3, -0.25], [0.0, -0.5], [0.0, -0.5]]
-    assert remembered(env.step(np.array([0.4]))[0]) == [[0.3, -0.25], [0.4, -0.25], [0.0, -0.5]]
-    assert remembered(env.step(np.array([0.5]))[0]) == [[0.3, -0.25], [0.4, -0.25], [0.0, -0.5]]
+    assert best_pairs(env.step(np.array([0.1]))[0]) == [[0.0, -0.5]] * 3
+    assert best_pairs(env.step(np.array([0.2]))[0]) == [[0.0, -0.5]] * 3
+    assert best_pairs(env.step(np.array([0.3]))[0]) == [[0.3, -0.25], [0.0, -0.5], [0.0, -0.5]]
+    assert best_pairs(env.step(np.array([0.4]))[0]) == [[0.3, -0.25], [0.4, -0.25], [0.0, -0.5]]
+    assert best_pairs(env.step(np.array([0.5]))[0]) == [[0.3, -0.25], [0.4, -0.25], [0.0, -0.5]]
 
 
 def test_memory_is_emptied_at_reset():
     env = BestActionMemory(Scripted([-0.5, -0.25, -0.75]), 2)
     env.reset()
     env.step(np.array([0.3]))
-    assert remembered(env.reset()[0]) == [[0.0, -0.75]] * 2
+    assert best_pairs(env.reset()[0]) == [[0.0, -0.75]] * 2
 
 
 def test_memory_follows_the_stack(phantom):
@@ -96,8 +96,8 @@ def test_memory_remembers_clipped_actions(phantom):
     env = make_armscan_env([phantom], memory=1)
     env.reset(seed=1)
     _, reward, *_ = env.step(np.array([5.0]))
-    assert reward <= env.get_wrapper_attr("remembered").pairs[0, 0, -1]
-    assert np.abs(env.get_wrapper_attr("remembered").pairs[0, :, :-1]).max() <= 1
+    assert reward <= env.get_wrapper_attr("history").pairs[0, 0, -1]
+    assert np.abs(env.get_wrapper_attr("history").pairs[0, :, :-1]).max() <= 1
 
 
 @pytest.mark.parametrize("arguments", [{"stack": 0}, {"stack": 1.5}, {"memory": -1}, {"memory": "a"}])

@@ -94,8 +94,8 @@ def _hover(trials: Sequence[FrozenTrial]) -> dict[str, Any]:
 def _history(trials: Sequence[FrozenTrial], number: int, objective: str, direction: StudyDirection) -> Figure:
     """Return the values of the trials in order, and the best so far among feasible ones."""
     figure = Figure()
-    for name, color, is_drawn in (("trial", BLUE, is_feasible), ("infeasible trial", GREY, _is_infeasible)):
-        drawn = list(filter(is_drawn, trials))
+    for name, color, is_kept in (("trial", BLUE, True), ("infeasible trial", GREY, False)):
+        drawn = [trial for trial in trials if is_feasible(trial) == is_kept]
         hover = _hover(drawn)
         points: dict[str, Any] = {"mode": "markers", "marker": {"color": color, "size": 7, "opacity": 0.7}}
         numbers, values = [trial.number for trial in drawn], list(map(_value(number), drawn))
@@ -108,10 +108,6 @@ def _history(trials: Sequence[FrozenTrial], number: int, objective: str, directi
     line = {"color": ORANGE, "width": 2, "shape": "hv"}
     figure.add_scatter(x=numbers, y=best, mode=mode(len(best)), line=line, marker={"size": 4}, name="best so far")
     return figure.update_layout(height=HEIGHT_PX, xaxis=axis, yaxis=_axis(objective), legend=LEGEND)
-
-
-def _is_infeasible(trial: FrozenTrial) -> bool:
-    return not is_feasible(trial)
 
 
 def _importance(rows: Sequence[Mapping[str, Any]]) -> Figure:

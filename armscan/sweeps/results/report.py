@@ -110,20 +110,16 @@ def _running(running: Sequence[FrozenTrial]) -> str:
             "seed": lease.get("seed", "–"),
             "environment steps": f"{env_steps_of(trial):,}",
             "return, mean": lease.get("return", "–"),
-            **_settings(trial),
+            **_settings(trial.params),
         }
         for trial, lease in ((each, each.user_attrs.get(LEASE, {})) for each in running)
     ]
     return f"<h2>Running now</h2>{table(rows)}" if rows else ""
 
 
-def _settings(trial: FrozenTrial) -> Row:
-    """Return the values of a trial by key; the table rounds them."""
-    return _plain(trial.params)
-
-
-def _plain(settings: Mapping[str, Any]) -> Row:
-    return {name: value if isinstance(value, int | float) else str(value) for name, value in settings.items()}
+def _settings(values: Mapping[str, Any]) -> Row:
+    """Return values by key; the table rounds them."""
+    return {name: value if isinstance(value, int | float) else str(value) for name, value in values.items()}
 
 
 def _trials(trials: Sequence[FrozenTrial], objectives: Sequence[str]) -> str:
@@ -138,7 +134,7 @@ def _trials(trials: Sequence[FrozenTrial], objectives: Sequence[str]) -> str:
                 "ended": _ended(trial),
                 **dict.fromkeys(map(title_of, objectives), ""),
                 **{title_of(name): value_text(name, value) for name, value in values},
-                **_settings(trial),
+                **_settings(trial.params),
                 "environment steps": f"{env_steps_of(trial):,}",
                 "run": str(trial.user_attrs.get(RUN, ""))[:ID_CHARS],
             }
@@ -155,7 +151,7 @@ def _ended(trial: FrozenTrial) -> str:
 
 def _failures(trials: Sequence[FrozenTrial]) -> str:
     failed = [trial for trial in trials if trial.state == TrialState.FAIL]
-    rows = [{"trial": trial.number, "cause": cause_of(trial), **_settings(trial)} for trial in failed]
+    rows = [{"trial": trial.number, "cause": cause_of(trial), **_settings(trial.params)} for trial in failed]
     return table(rows, what="failures") if rows else "<p>No trial has failed.</p>"
 
 
@@ -193,7 +189,7 @@ def _judgement(judgement: Judgement) -> str:
 def _result(found: Sequence[ConfigResult], trials: Sequence[FrozenTrial]) -> str:
     """Return the table of the result, and the settings of each trial in it."""
     of_each = {result.number: settings_of(trials, result.number) for result in found}
-    rows = [{"configuration": name_of(number), **_plain(settings)} for number, settings in of_each.items()]
+    rows = [{"configuration": name_of(number), **_settings(settings)} for number, settings in of_each.items()]
     words = {number: html.escape(" ".join(overrides_of(settings))) for number, settings in of_each.items() if settings}
     items = "".join(f"<li>{name_of(number)}: <code>{text}</code></li>" for number, text in words.items())
     typed = folded("As words of the command line, with all digits", f"<ul>{items}</ul>") if items else ""

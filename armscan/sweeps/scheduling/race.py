@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from armscan.stats.bootstrap import LEVEL, Estimate
+from armscan.stats.bootstrap import UNKNOWN, UPPER, Estimate
 from armscan.utils.arrays import FloatArray
 
 # For an early end of the race: the level of the one-sided t tests of the leader against each other configuration, and
@@ -32,8 +32,6 @@ PRIOR_DF = 4.0
 # Minimum gap between two means, relative to the largest mean and absolute, because gaps are divisors. So are variances,
 # to which the square of the gap is added.
 MIN_RELATIVE_GAP, MIN_GAP = 1e-6, 1e-100
-
-UNKNOWN = Estimate(math.nan, math.nan, math.nan)
 
 Scores = Mapping[int, Mapping[int, float]]
 Counts = NDArray[np.intp]
@@ -184,7 +182,7 @@ def half_widths(variances: FloatArray, n_seeds: Any) -> FloatArray:
         variances: Variance of the scores of each configuration.
         n_seeds: Number of seeds of each.
     """
-    return np.asarray(stdtrit(PRIOR_DF + n_seeds - 1, (1 + LEVEL) / 2) * np.sqrt(variances / n_seeds))
+    return np.asarray(stdtrit(PRIOR_DF + n_seeds - 1, UPPER) * np.sqrt(variances / n_seeds))
 
 
 def is_decided(means: FloatArray, variances: FloatArray, n_seeds: Counts) -> NDArray[np.bool_]:
@@ -232,4 +230,4 @@ def _standings(means: FloatArray, variances: FloatArray, n_seeds: Counts) -> Ite
     # With one seed each, the variance is unknown.
     half = half if n_seeds.max() > 1 else np.full_like(half, math.nan)
     for mean, width, n in zip(means.tolist(), half.tolist(), n_seeds.tolist(), strict=True):
-        yield Standing(Estimate(mean, mean - width, mean + width), n)
+        yield Standing(Estimate.around(mean, width), n)

@@ -11,7 +11,7 @@ import optuna
 from optuna.trial import FrozenTrial, TrialState
 from pydantic import ConfigDict, Field
 
-from armscan.errors import ArmscanError, StudyError, few
+from armscan.errors import ArmscanError, StudyError, few, reason_of
 from armscan.sweeps.storage.attribute_names import FINAL_SEED, FINALIST, METRICS, PARENT
 from armscan.sweeps.storage.reports import REPORT
 from armscan.utils.section import Section
@@ -23,7 +23,6 @@ SELECTION_SUFFIX, JUDGEMENT_SUFFIX = FINAL_SUFFIXES = ("-selection", "-judged")
 # Errors that Optuna raises when it reads data that it has not written.
 DAMAGED = (ValueError, TypeError, AttributeError, AssertionError)
 UNREADABLE = (*DAMAGED, LookupError)
-MAX_REASON_CHARS = 300
 # SQLite's largest whole number.
 LARGEST = 2**63 - 1
 MAX_STEP_DIGITS = 18
@@ -160,8 +159,7 @@ def place_of(study_name: str, trial: FrozenTrial) -> str:
 
 def unreadable(what: str, error: Exception) -> StudyError:
     """Return a one-line error: the trials of `what` cannot be read."""
-    reason = " ".join(str(error).split()) or repr(error)
-    return StudyError(f"the trials of {what} cannot be read: {reason[:MAX_REASON_CHARS]}")
+    return StudyError(f"the trials of {what} cannot be read: {reason_of(error)}")
 
 
 def _wrong_numbers(trial: FrozenTrial, n_objectives: int) -> str | None:

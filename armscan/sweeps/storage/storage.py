@@ -16,13 +16,12 @@ from optuna.study import Study
 from sqlalchemy.exc import SQLAlchemyError
 
 from armscan.config.credentials import STORAGE_PASSWORD, check_address, database_url, mask_passwords
-from armscan.errors import StorageUnavailableError, StudyError
+from armscan.errors import MAX_REASON_CHARS, StorageUnavailableError, StudyError, in_one_line
 from armscan.sweeps.storage.database import DatabaseStorage, open_database, tables_in
 from armscan.sweeps.storage.journal import CheckedJournal, open_journal
 from armscan.utils.files import SQLITE_PREFIX, sqlite_file
 
 T = TypeVar("T")
-MAX_REASON_CHARS = 300
 # Some of Optuna's tables.
 TABLES = {"studies", "trials", "version_info"}
 
@@ -167,4 +166,4 @@ def _reason(error: Exception) -> str:
             return f"{error.name} is not installed: pip install 'armscan[postgres]'"
         case OSError():
             return f"no file can be used there ({error.strerror})"
-    return "this storage cannot be used: " + mask_passwords(" ".join(str(error).split()))[:MAX_REASON_CHARS]
+    return "this storage cannot be used: " + mask_passwords(in_one_line(error))[:MAX_REASON_CHARS]

@@ -19,7 +19,7 @@ from armscan.config.compose import compose, compose_run, of_run
 from armscan.config.defaults import to_plain
 from armscan.config.error_messages import one_line_message
 from armscan.config.sources import SWEEP
-from armscan.errors import ArmscanError, InvalidValueError, StudyError, listed
+from armscan.errors import ArmscanError, InvalidValueError, StudyError, listed, reason_of
 from armscan.sweeps.space.parameter import Value, overrides_of
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.study.arguments import fixed_by
@@ -91,8 +91,7 @@ def make(name: str, described: Mapping[str, Any], kind: type[Any], **arguments: 
     try:
         made = instantiate(described, **arguments)
     except InstantiationException as error:
-        reason = " ".join(str(error.__cause__ or error).split())
-        raise InvalidValueError(f"study.{name} cannot be made: {reason}") from error
+        raise InvalidValueError(f"study.{name} cannot be made: {reason_of(error.__cause__ or error)}") from error
     if not isinstance(made, kind):
         raise InvalidValueError(f"study.{name} is {described['_target_']}, but it must be a {name} of Optuna")
     return made

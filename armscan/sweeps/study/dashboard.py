@@ -16,7 +16,7 @@ from armscan.tracking import TrackingStore
 from armscan.training.metric_display import COSTS, leading_among, title_of, value_text
 from armscan.utils.files import sha256
 from armscan.utils.log import log
-from armscan.utils.markdown import markdown_table
+from armscan.utils.text import markdown_table
 
 # Where `armscan ui` serves the runs of a local store, unless it is given another port.
 LOCAL_UI = f"http://127.0.0.1:{MLFLOW_PORT}"

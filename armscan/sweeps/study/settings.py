@@ -17,6 +17,7 @@ from armscan.sweeps.space.space import Space
 from armscan.sweeps.storage.attributes import FINAL_SUFFIXES
 from armscan.sweeps.study.constraints import Constraint
 from armscan.utils.section import Section
+from armscan.utils.text import counted
 from armscan.utils.validation import MAX_SEED
 
 NAME = re.compile(rf"(?!.*(?:{'|'.join(FINAL_SUFFIXES)})$)\w[\w\-.]{{0,99}}")
@@ -207,8 +208,7 @@ class StudySettings(Limits):
         n_threads = int(given)
         if self.workers * n_threads > n_cores:
             each = "" if n_threads == 1 else f" of {n_threads} compute threads each (OMP_NUM_THREADS)"
-            cores = "1 core" if n_cores == 1 else f"{n_cores} cores"
             raise InvalidValueError(
-                f"study.workers is {self.workers}{each}, but this machine has {cores}: give at most "
+                f"study.workers is {self.workers}{each}, but this machine has {counted(n_cores, 'core')}: give at most "
                 f"{max(1, n_cores // n_threads)}"
             )

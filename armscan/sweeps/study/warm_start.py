@@ -38,7 +38,6 @@ from armscan.sweeps.study.study import best_trials, comparable_settings, fixed_o
 PRESET, SOURCE = "preset {}", "study {}"
 # Number of best settings that are tried first, of a study with another configuration.
 N_ENQUEUED = 10
-NO_LIMIT = 10**9
 # In `study.enqueue`: the configuration of the study itself.
 DEFAULT = "default"
 # User attributes that a taken trial keeps.
@@ -157,7 +156,7 @@ def _of_study(settings: StudySettings, name: str, fixed: Mapping[str, Any], stor
         taken = tuple(_taken(name, trial, chosen, settings.space) for trial, chosen in fitting)
         return InitialTrials(SOURCE.format(name), f"{message}{len(taken)} taken with their values{left}", taken)
     settings_of = {trial.number: chosen for trial, chosen in fitting if chosen}
-    best = best_trials(source, NO_LIMIT)
+    best = best_trials(source, len(trials))
     first = first_different(settings_of[trial.number] for trial in best if trial.number in settings_of)
     message += f"none taken with its value, because {difference}; the settings of the best {len(first)} are tried first"
     return InitialTrials(SOURCE.format(name), message + left, (), first)

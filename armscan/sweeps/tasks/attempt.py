@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -23,6 +22,7 @@ from armscan.sweeps.storage.attribute_names import ENV_STEPS, EPISODES, INTERVAL
 from armscan.sweeps.storage.reports import reports_of, store_report
 from armscan.tracking import TrackedRun
 from armscan.training import Evaluation, Split
+from armscan.utils.files import sha256
 from armscan.utils.validation import check_float
 
 TRIAL_DIGITS, N_SUM_CHARS = 4, 12
@@ -219,12 +219,11 @@ def trial_folder(study_folder: Path, number: int) -> Path:
 
 def config_sha256(config: Mapping[str, Any]) -> str:
     """Return the SHA-256 of a configuration's values except the seed, by which the runs of one trial differ."""
-    values = {key: value for key, value in config.items() if key != "seed"}
-    return _sha256(values)
+    return _sha256({key: value for key, value in config.items() if key != "seed"})
 
 
 def _sha256(values: Mapping[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(values, sort_keys=True, default=str).encode()).hexdigest()
+    return sha256(json.dumps(values, sort_keys=True, default=str).encode())
 
 
 def volumes_of(config: DictConfig) -> Split:

@@ -70,15 +70,15 @@ class LandmarksTask:
         reward = instantiate(config.reward, _convert_="object").fit(volumes_of(config).training.values(), tissues)
         at_plane, elsewhere = [], []
         for volume in volumes.values():
-            judge, labelled = PlaneScorer(volume, reward, tissues), volume.optimal_action
+            scorer, labelled = PlaneScorer(volume, reward, tissues), volume.optimal_action
             if labelled is None:
                 raise InvalidValueError(f"{volume.name}: has no labelled plane, which clusterings are judged by")
-            at_plane.append(judge.seen(labelled)[0])
+            at_plane.append(scorer.score(labelled)[0])
             tx_mm, ty_mm = labelled.translation
             places = np.arange(0.0, volume.size_mm[1], STEP_MM)
             far = [place for place in places if abs(place - ty_mm) > NEAR_MM]
             planes = [ManipulatorAction(labelled.rotation, (tx_mm, float(place))) for place in far]
-            elsewhere.append(fmean(judge.seen(plane)[0] for plane in planes))
+            elsewhere.append(fmean(scorer.score(plane)[0] for plane in planes))
         right, wrong = fmean(at_plane), fmean(elsewhere)
         return dict(zip(METRICS, (right - wrong, right, wrong, min(at_plane)), strict=True))
 

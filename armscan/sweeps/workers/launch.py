@@ -16,7 +16,7 @@ from armscan.config.command_hints import armscan_command
 from armscan.config.defaults import TRACKING_URI
 from armscan.config.error_messages import one_line_message
 from armscan.config.sources import working_folder
-from armscan.errors import ArmscanError, StudyError
+from armscan.errors import ArmscanError, StudyError, reason_of
 from armscan.launch.launchers import LAUNCHER, ON_THIS_MACHINE, silence_launcher
 from armscan.sweeps.results.judgement import best_metrics, judge, result_note
 from armscan.sweeps.results.progress import progress_display
@@ -38,7 +38,6 @@ from armscan.utils.retry import no_retry
 LEAVE_S, LEAVE_ELSEWHERE_S = 4.0, 20.0
 # Ten years: a study has limits of its own.
 MINUTES_WITHOUT_END = 5_256_000
-MAX_REASON_CHARS = 500
 Launch = Callable[[Sequence[str]], object]
 
 
@@ -116,8 +115,9 @@ def _launch_elsewhere(monitor: StudyMonitor, folder: Path, launcher: str, launch
         print(f"error: {error}", file=sys.stderr)
     # Any error of a launcher, which may fail for one cancelled job while all others continue.
     except Exception as error:
-        line = one_line_message(error) or " ".join(str(error).split()) or repr(error)
-        failed = StudyError(f"{LAUNCHER} is {launcher!r}, which has failed: {line[:MAX_REASON_CHARS]}")
+        failed = StudyError(
+            f"{LAUNCHER} is {launcher!r}, which has failed: {one_line_message(error) or reason_of(error)}"
+        )
         if not any(folder.glob(WORKER_FILES)):
             raise failed from error
         print(f"{failed}; waiting for workers that are still there", file=sys.stderr)
@@ -208,16 +208,16 @@ def _block_sigint() -> Iterator[None]:
 
 def _end_workers(folder: Path) -> None:
     """Wait for the workers on this machine to leave, kill those that do not, and wait for their end."""
-    if alive := _alive_after(LEAVE_S, folder):
+    if alive := _still_alive(folder):
         for worker in alive:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(worker.pid, signal.SIGKILL)
-        _alive_after(LEAVE_S, folder)
+        _still_alive(folder)
 
 
-def _alive_after(wait_s: float, folder: Path) -> list[ProcessInfo]:
-    """Wait for the workers on this machine to end; return those that are alive after `wait_s`."""
-    until_s = time.monotonic() + wait_s
+def _still_alive(folder: Path) -> list[ProcessInfo]:
+    """Wait for the workers on this machine to end; return those that are alive after `LEAVE_S`."""
+    until_s = time.monotonic() + LEAVE_S
     while (alive := local_workers(folder)) and time.monotonic() < until_s:
         time.sleep(0.05)
     return alive

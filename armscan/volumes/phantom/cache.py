@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import sys
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
@@ -11,7 +10,7 @@ from pathlib import Path
 from weakref import WeakValueDictionary
 
 from armscan.errors import InvalidValueError
-from armscan.utils.files import cache_folder
+from armscan.utils.files import cache_folder, sha256
 from armscan.volumes import plane, volume
 from armscan.volumes.mapped import SUFFIX, mapped_volume, open_mapped
 from armscan.volumes.phantom import generate, tube, varied, wrist
@@ -78,7 +77,5 @@ def _path(seed: int, cache_dir: Path | None, version: int) -> Path:
 @cache
 def _generator_version() -> str:
     """Return the fingerprint of the generator's sources, so that a change in them invalidates cached phantoms."""
-    digest = hashlib.sha256()
-    for module in (generate, tube, varied, wrist, plane, volume):
-        digest.update(Path(str(module.__file__)).read_bytes())
-    return digest.hexdigest()[:12]
+    modules = (generate, tube, varied, wrist, plane, volume)
+    return sha256(b"".join(Path(str(module.__file__)).read_bytes() for module in modules))[:12]

@@ -9,7 +9,7 @@ from typing import Any
 
 import pandas as pd
 
-from armscan.utils.markdown import markdown_table
+from armscan.utils.text import markdown_table
 from benchmarks.sweeps.bench.importance import Key, keys_of
 from benchmarks.sweeps.bench.picture import draw
 from benchmarks.sweeps.bench.power import needed_seeds, power_of, residuals_of_good_configs

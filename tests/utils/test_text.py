@@ -1,10 +1,10 @@
-"""Rates as strings."""
+"""Numbers and rates as text."""
 
 import math
 
 import pytest
 
-from armscan.utils.rate_text import formatted
+from armscan.utils.text import formatted
 
 
 @pytest.mark.parametrize(
