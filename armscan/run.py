@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 
-from armscan.utils.processes import collect_garbage_rarely, limit_threads, no_garbage_collection
+from armscan.utils.processes import collect_garbage_rarely, discard_output, limit_threads, no_garbage_collection
 
 limit_threads()
 collect_garbage_rarely()
@@ -141,8 +141,7 @@ def main() -> int:
             check_grid(words)
             launch(words)
     except BrokenPipeError:
-        # The reader of --help, such as `head`, may have closed the pipe: nothing can be written, not even on exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        discard_output()
         return 1
     except (KeyboardInterrupt, Exception) as error:
         # An interrupt inside compiled code can surface as any other error.

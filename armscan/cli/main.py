@@ -16,7 +16,7 @@ from armscan.cli.runs import runs
 from armscan.cli.ui import ui
 from armscan.errors import in_one_line, is_interruption, print_error
 from armscan.utils.log import silence_libraries
-from armscan.utils.processes import collect_garbage_rarely
+from armscan.utils.processes import collect_garbage_rarely, discard_output
 
 PROGRAM = "armscan"
 INTERRUPTED = 130
@@ -77,6 +77,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except click.ClickException as error:
         print_error(in_one_line(error.format_message()))
         return error.exit_code
+    except BrokenPipeError:
+        discard_output()
+        return 1
     except Exception as error:
         if is_interruption(error):
             print("interrupted", file=sys.stderr)

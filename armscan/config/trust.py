@@ -109,7 +109,7 @@ def untrusted_word(words: Sequence[str], uri: str) -> str | None:
         # Hydra also accepts a quoted value.
         value = value.strip("'\"")
         # A server is sent this user's password.
-        is_elsewhere = value != uri and SERVER.search(value) is not None
+        is_elsewhere = value.rstrip("/") != uri.rstrip("/") and SERVER.search(value) is not None
         is_changing_hydra = "hydra" in key or key.startswith("-") or key.partition("@")[0] == SWEEP
         # A key with dots is a value, which may be any path, and never a group.
         is_outside = "." not in key.partition("@")[0] and OUTSIDE.search(value) is not None
@@ -143,7 +143,7 @@ def check_stored_address(uri: str, own: Collection[str]) -> None:
         uri: Address of a tracking store, as a folder or a store names it.
         own: Addresses of this user's stores.
     """
-    if not uri.startswith(SQLITE_PREFIX) and uri not in own:
+    if not uri.startswith(SQLITE_PREFIX) and uri.rstrip("/") not in (each.rstrip("/") for each in own):
         raise UntrustedError(
             f"{uri} is not a store that this user has used here, and it could be sent this user's passwords: give "
             f"--tracking {uri} if it is yours"

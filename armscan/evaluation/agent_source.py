@@ -13,7 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from armscan.config.compose import compose
 from armscan.config.defaults import CHANGES
 from armscan.errors import CheckpointError, InvalidValueError
-from armscan.experiment.build import check_sections
+from armscan.experiment.build import check_keys, check_sections
 from armscan.tracking.lookup import FoundRun, load_run
 from armscan.tracking.tags import DOMAIN_TAG, EVALUATED_TAG
 from armscan.training import CheckpointProvenance, Fingerprints, TrainingDomain, load_weights
@@ -79,6 +79,7 @@ def agent_of_overrides(words: Sequence[str], folder: str | None, changes: Mappin
         changes: Changed rules, by the names in `CHANGES`.
     """
     config = compose(words)
+    check_keys(config)
     if folder:
         config.data.path = folder
     OmegaConf.resolve(config)

@@ -35,6 +35,7 @@ from armscan.training import (
 from armscan.training.domain import smallest_slice, with_crops
 from armscan.training.episode_results import Env
 from armscan.utils.log import silence_libraries
+from armscan.utils.text import counted
 from armscan.utils.validation import check_int, check_seed
 from armscan.volumes import LabelVolume
 
@@ -136,6 +137,9 @@ def build_experiment(config: DictConfig, split: Split | None = None) -> Experime
         validation=split.validation,
         schedule=budget.segments,
     )
+    _check_episodes("evaluation.episodes", config.evaluation.episodes, "test", split)
+    if isinstance(agent, Learner):
+        _check_episodes("training.validation_episodes", budget.validation_episodes, "validation", split)
     return Experiment(
         split=split,
         env_factory=env_factory,
@@ -146,6 +150,14 @@ def build_experiment(config: DictConfig, split: Split | None = None) -> Experime
         seed=config.seed,
         smallest_slice_px=smallest,
         needs_trust=needs_trust(to_plain(config)),
+    )
+
+
+def _check_episodes(key: str, n_episodes: int, part: str, split: Split) -> None:
+    """Raise `InvalidValueError` if some of the volumes that a result is about would never be seen."""
+    n_volumes = len(split.parts[part])
+    check_int(
+        f"{key}, of which each of the {counted(n_volumes, f'{part} volume')} gets one,", n_episodes, at_least=n_volumes
     )
 
 

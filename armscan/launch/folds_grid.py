@@ -10,6 +10,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from armscan.config.compose import compose
 from armscan.config.defaults import FOLD, FOLDS, MULTIRUN
+from armscan.errors import InvalidValueError
 
 # What may set `data.folds`.
 MAY_SET_FOLDS = (f"{FOLDS}=", "experiment=")
@@ -37,6 +38,8 @@ def with_folds(words: Sequence[str]) -> list[str]:
     # Hydra or the run reports it.
     except (HydraException, OmegaConfBaseException):
         return list(words)
+    if any(each.key_or_group == FOLDS and each.is_sweep_override() for each in parsed):
+        raise InvalidValueError(f"{FOLDS} has several values, but a grid has one number of folds: start one for each")
     if folds is None or fold is not None or any(each.key_or_group == FOLD for each in parsed):
         return list(words)
     # Deferred: command-line errors are reported before these are loaded.

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from mlflow.entities import Run
 
     from armscan.tracking import TrackingStore
+    from armscan.tracking.outbox import Outbox
     from armscan.training import ResultTable
 
 # Hydra's own overrides that select the multirun mode and its folder.
@@ -53,6 +54,8 @@ class Multirun(Callback):
     """
 
     folder: Path | None = None
+    # Of the parent run; open while the jobs run.
+    outbox: Outbox | None = None
     # Run ID of the grid that this multirun repeats without its finished jobs, and whether they may build any class.
     repeats: str | None = None
     is_trusted = True
@@ -79,7 +82,7 @@ class Multirun(Callback):
         folder = Path(config.hydra.sweep.dir)
         print(f"preparing a multirun in {folder}", flush=True)
         # Deferred: it loads MLflow, after the first line is printed.
-        from armscan.tracking import open_store, source
+        from armscan.tracking import begin_outbox, open_store, source
 
         if not isinstance(config.tracking, DictConfig):
             raise InvalidValueError(f"tracking is {config.tracking!r}, but it must be a section, such as its default")
@@ -103,7 +106,7 @@ class Multirun(Callback):
         is_told = Multirun.repeats is not None and Multirun.is_trusted
         parent |= {"trust": is_told or untrusted_word(again, tracking["uri"]) is not None}
         (folder / PARENT_FILE).write_text(json.dumps(parent))
-        Multirun.folder = folder
+        Multirun.folder, Multirun.outbox = folder, begin_outbox(folder, run.info.run_id, tracking["uri"])
 
 
 def _common(overrides: Sequence[str]) -> list[str]:
@@ -136,14 +139,15 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
         return 0
     folder, outcomes = Multirun.folder, _read_outcomes(Multirun.folder)
     failed = {number: outcome for number, outcome in outcomes.items() if outcome.failure is not None}
-    if is_interrupted:
-        # A job without an outcome was interrupted, too, which is not a failure.
-        unended = {number for number, outcome in failed.items() if outcome.failure in (NO_OUTCOME, INTERRUPTED)}
-        outcomes |= {number: replace(failed.pop(number), failure=INTERRUPTED) for number in unended}
-    status = "KILLED" if is_interrupted else "FAILED" if failed or not outcomes else "FINISHED"
+    # An interruption is not a failure: of one job, by `armscan runs stop`, or of all, when some write no outcome.
+    endings = (INTERRUPTED, NO_OUTCOME) if is_interrupted else (INTERRUPTED,)
+    interrupted = {number for number, outcome in failed.items() if outcome.failure in endings}
+    outcomes |= {number: replace(failed.pop(number), failure=INTERRUPTED) for number in interrupted}
+    has_failed = bool(failed) or not outcomes
+    status = "KILLED" if is_interrupted or (interrupted and not has_failed) else "FAILED" if has_failed else "FINISHED"
     parent = json.loads((folder / PARENT_FILE).read_text())
     try:
-        store, runs = _close_parent(folder, parent, status, failed)
+        store, runs = _close_parent(folder, parent, status, outcomes)
     except TrackingError as error:
         print(f"{error}; {armscan_command('runs', 'sync', str(folder))} uploads the rest", file=sys.stderr)
         store, runs = None, []
@@ -163,7 +167,7 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
         _print_resume_commands(parent, runs)
     if store is not None and not runs:
         remove_run_folder(folder)
-    return 1 if failed or not outcomes else 0
+    return 0 if status == "FINISHED" else 1
 
 
 def print_resume_command() -> None:
@@ -249,7 +253,7 @@ def _pool_folds(
 
 
 def _close_parent(
-    folder: Path, parent: Mapping[str, Any], status: str, failed: Mapping[str, JobOutcome]
+    folder: Path, parent: Mapping[str, Any], status: str, outcomes: Mapping[str, JobOutcome]
 ) -> tuple[TrackingStore, list[Run]]:
     """Close the parent run and the open runs of killed jobs; delete the parent if no job has started a run.
 
@@ -260,7 +264,10 @@ def _close_parent(
     from armscan.tracking import note_end, open_store, sync
     from armscan.tracking.sync import PROCESS_DIED
 
+    failed = {number: each for number, each in outcomes.items() if each.failure not in (None, INTERRUPTED)}
     tags = {f"failure.{number}": f"{each.varied}: {each.failure}" for number, each in failed.items()}
+    if Multirun.outbox is not None:
+        Multirun.outbox.close()
     note_end(folder, parent["run_id"], parent["tracking"]["uri"], status, tags)
     store, experiment_id = open_store(**parent["tracking"], retry_s=parent["tracking"]["wait_s"])
     # Uploads what the jobs could not while the store was unavailable.
@@ -271,7 +278,8 @@ def _close_parent(
     for child in children:
         # `sync` has closed the runs whose processes could not.
         if child.info.status == "RUNNING" or child.data.tags.get(FAILURE_TAG) == PROCESS_DIED:
-            is_killed = status == "KILLED"
+            outcome = outcomes.get(child.data.tags[JOB_TAG])
+            is_killed = outcome is not None and outcome.failure == INTERRUPTED
             store.set_tag(child.info.run_id, FAILURE_TAG, INTERRUPTED if is_killed else NO_OUTCOME)
             store.set_terminated(child.info.run_id, "KILLED" if is_killed else "FAILED")
     if not children:

@@ -106,8 +106,8 @@ def of_common_folds(trainings: Iterable[TrackedTraining]) -> list[TrackedTrainin
 
 def differing_rules(groups: Sequence[Group]) -> list[str]:
     """Return the keys, apart from the agent's, in which the groups' episodes differ."""
-    keys = _differing([_compared(group.trainings[0].params) for group in groups])
-    return [key for key in keys if key.startswith(RULES)]
+    params = [_compared(group.trainings[0].params) for group in groups]
+    return _differing([{key: value for key, value in each.items() if key.startswith(RULES)} for each in params])
 
 
 def _one_for_each_seed(trainings: Iterable[TrackedTraining]) -> list[TrackedTraining]:

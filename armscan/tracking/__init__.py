@@ -15,13 +15,14 @@ from armscan.tracking.plots import draw_learning_curve
 from armscan.tracking.run import TrackedRun
 from armscan.tracking.sanitize import flatten, tags_of
 from armscan.tracking.store import check_artifacts, check_settings, open_existing_store, open_store
-from armscan.tracking.sync import abandon, note_end, sync, upload_pending
+from armscan.tracking.sync import abandon, begin_outbox, note_end, sync, upload_pending
 
 __all__ = [
     "FoundRun",
     "TrackedRun",
     "TrackingStore",
     "abandon",
+    "begin_outbox",
     "check_artifacts",
     "check_run_id",
     "check_settings",

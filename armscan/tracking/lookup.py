@@ -13,7 +13,7 @@ from packaging.version import InvalidVersion, Version
 
 import armscan
 from armscan.config.trust import needs_trust, stored_config
-from armscan.errors import TrackingError, listed
+from armscan.errors import TrackingError, TrackingUnavailableError, listed
 from armscan.tracking.client import TrackingStore, all_pages
 from armscan.tracking.store import open_existing_store, store_errors
 from armscan.tracking.tags import EVALUATED_TAG, VERSION_TAG
@@ -176,12 +176,18 @@ def run_of_study(
     Raises:
         TrackingError: If the run does not belong to the study, or is not in the store.
     """
-    with store_errors(client.uri):
-        run: Run = client.get_run(run_id)
-    others = [name for name, value in tags.items() if run.data.tags.get(name) != value]
+    try:
+        with store_errors(client.uri):
+            run: Run = client.get_run(run_id)
+    except TrackingUnavailableError:
+        raise
+    except TrackingError as error:
+        raise TrackingError(f"{where}: {error}") from error
     if run.info.experiment_id != experiment_id:
-        others.insert(0, "experiment")
-    if others:
+        raise TrackingError(
+            f"{where} names run {run_id}, which is another's, or tracking.experiment was another before: left as it is"
+        )
+    if others := [name for name, value in tags.items() if run.data.tags.get(name) != value]:
         raise TrackingError(f"{where} names run {run_id}, which is another's, as its {others[0]} says: left as it is")
     return run
 

@@ -14,7 +14,7 @@ from armscan.tracking.client import TrackingStore
 from armscan.tracking.environment import DIFF_SUM, environment_tags, source
 from armscan.tracking.notes import forget
 from armscan.tracking.outbox import Address, Outbox, file_of, now_ms
-from armscan.tracking.sanitize import params_of, tags_of
+from armscan.tracking.sanitize import metric_name_of, params_of, tags_of
 from armscan.tracking.system_metrics import PREFIX, SystemMetrics
 from armscan.tracking.tags import FAILURE_TAG, PARENT_TAG, PRUNED_TAG
 from armscan.tracking.uploader import Uploader
@@ -120,8 +120,10 @@ class TrackedRun:
         changed = {f"resumed.{key}": value for key, value in now.items() if run.data.tags.get(key) != value}
         had_outbox = file_of(folder, run_id).exists()
         outbox = Outbox.begin(folder, Address(run_id, store.uri))
+        entries = list(outbox.entries())
+        params = set(run.data.params).union(*(entry.get("params", ()) for entry in entries))
         if had_outbox:
-            logged = {(name, step) for entry in outbox.entries() for name, _, _, step in entry.get("metrics", ())}
+            logged = {(name, step) for entry in entries for name, _, _, step in entry.get("metrics", ())}
         else:
             # An earlier version made the run, without an outbox.
             histories = {name: store.get_metric_history(run_id, name) for name in run.data.metrics}
@@ -129,7 +131,7 @@ class TrackedRun:
         tracked = cls(store, outbox, name=run.info.run_name or run_id, logged=logged)
         tracked.resume()
         tracked.set_tags(dict(tags) | changed | {"resumed": str(n_resumed)})
-        tracked._log_config(config)
+        tracked._log_config(config, known=params)
         if (diff := source().diff) and f"resumed.{DIFF_SUM}" in changed:
             file = folder / RESUMED_DIFF_FILE.format(n_resumed)
             atomic_write(file, diff)
@@ -153,8 +155,9 @@ class TrackedRun:
         """
         self._add(datasets=[[part, volumes] for part, volumes in prints.items() if volumes])
 
-    def _log_config(self, config: Mapping[str, Any]) -> None:
-        if params := params_of(config):
+    def _log_config(self, config: Mapping[str, Any], known: Collection[str] = ()) -> None:
+        # MLflow refuses to change a parameter, such as the device.
+        if params := {name: value for name, value in params_of(config).items() if name not in known}:
             self._add(params=params)
 
     def on_start(self, total_env_steps: int, earlier: Sequence[EpochReport]) -> None:
@@ -192,7 +195,7 @@ class TrackedRun:
         at_ms = now_ms()
         points = [
             (name, float(value), at_ms, n_env_steps)
-            for name, value in figures.items()
+            for name, value in zip(map(metric_name_of, figures), figures.values(), strict=True)
             # NaN is the mean over no episodes.
             if (keeps_nan or value == value) and (name, n_env_steps) not in self._logged
         ]
@@ -253,6 +256,10 @@ class TrackedRun:
         self._is_resumed = True
         self._add(status=("RUNNING", now_ms()))
         self._add(untagged=FAILURE_TAG)
+
+    def end_requeued(self) -> None:
+        """Close the run of a trial that is requeued, for another worker to resume."""
+        self.end("KILLED", reason="requeued", wait_s=SHORT_WAIT_S)
 
     def end(self, status: str, *, reason: str | None = None, wait_s: float | None = None) -> bool:
         """Close the run, and wait until everything is uploaded.

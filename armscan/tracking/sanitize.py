@@ -40,12 +40,18 @@ def flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return leaves
 
 
-def name_of(key: str) -> str:
+def metric_name_of(key: str) -> str:
+    """Return the key of a metric as a name that MLflow accepts; its last part, such as `mean_steps`, stays."""
+    group, _, metric = key.rpartition("/")
+    return name_of(f"{name_of(group, MAX_KEY_CHARS - len(metric) - 1)}/{metric}" if group else metric)
+
+
+def name_of(key: str, max_chars: int = MAX_KEY_CHARS) -> str:
     """Return a key as a name that MLflow accepts; a changed one ends with a checksum, so that names stay distinct."""
     name = posixpath.normpath(REFUSED.sub("_", key).strip(REFUSED_ENDS).replace("..", "._") or "_")
-    if name == key and len(key) <= MAX_KEY_CHARS:
+    if name == key and len(key) <= max_chars:
         return key
-    return f"{name[: MAX_KEY_CHARS - N_SUM_CHARS - 1]}-{sha256(key.encode())[:N_SUM_CHARS]}"
+    return f"{name[: max_chars - N_SUM_CHARS - 1]}-{sha256(key.encode())[:N_SUM_CHARS]}"
 
 
 def truncate(text: str, at_most: int, whole_in: str) -> str:

@@ -196,6 +196,9 @@ def store_errors(uri: str) -> Iterator[None]:
             # SQLAlchemy warns about deprecated calls that MLflow makes.
             warnings.simplefilter("ignore")
             yield
+    # Not the store's: the reader of this process's output, such as `head`, has ended.
+    except BrokenPipeError:
+        raise
     except (MlflowException, SQLAlchemyError, OSError, ModuleNotFoundError) as error:
         raise TrackingError(f"tracking.uri is {uri!r}, but this store cannot be used: {reason_in(error)}") from error
 

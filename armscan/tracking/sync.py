@@ -204,10 +204,16 @@ def abandon(folder: Path, store: TrackingStore, reason: str) -> None:
             TrackedRun(store, outbox, name=outbox.address.run_id).end("FAILED", reason=reason, wait_s=SHORT_WAIT_S)
 
 
+def begin_outbox(folder: Path, run_id: str, uri: str) -> Outbox:
+    """Open the outbox of a run, with this machine's note: if this process dies, a later one closes the run."""
+    outbox = Outbox.begin(folder, Address(run_id, absolute(uri)))
+    outbox.note(absolute(uri))
+    return outbox
+
+
 def note_end(folder: Path, run_id: str, uri: str, status: str, tags: Mapping[str, str]) -> None:
     """Record a run's end in its outbox, for `sync` to upload, without contacting the store."""
-    with contextlib.closing(Outbox.begin(folder, Address(run_id, absolute(uri)))) as outbox:
-        outbox.note(absolute(uri))
+    with contextlib.closing(begin_outbox(folder, run_id, uri)) as outbox:
         if tags:
             outbox.add(tags=tags_of(tags))
         outbox.add(status=(status, now_ms()))

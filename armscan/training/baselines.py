@@ -46,7 +46,7 @@ def evaluate_baselines(
     free = [name for name in names if name in COMPONENTS]
     if len(free) == 1:
         steps = Exhaustive()
-        step = f"{steps.step_deg:g}°" if free[0] in ROTATIONS else f"{steps.step_mm:g} mm"
+        step = f"{steps.step_deg:g} deg" if free[0] in ROTATIONS else f"{steps.step_mm:g} mm"
         agents[f"sweep {step}"] = ExhaustiveAgent(names, free, step_mm=steps.step_mm, step_deg=steps.step_deg)
     rules = _rules_of(env.get_wrapper_attr("rules"))
     evaluations = {}

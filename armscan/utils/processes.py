@@ -50,6 +50,12 @@ def collect_garbage_rarely() -> None:
     atexit.register(gc.freeze)
 
 
+def discard_output() -> None:
+    """Discard what is still printed: the reader of this process's output, such as `head`, has ended."""
+    # Otherwise the interpreter fails on exit, when it writes the rest.
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
 @contextmanager
 def no_garbage_collection() -> Iterator[None]:
     """Collect no garbage inside the context, while permanent objects are made, and never scan these again."""

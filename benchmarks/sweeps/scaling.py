@@ -25,8 +25,8 @@ from unittest import mock
 import optuna
 from omegaconf import DictConfig, OmegaConf
 
+from armscan.sweeps.scheduling.limits import Limits
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import Limits
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.phase import Phase

@@ -21,9 +21,10 @@ from optuna.distributions import BaseDistribution, CategoricalDistribution, Floa
 from optuna.trial import TrialState
 
 from armscan.config.defaults import to_plain
+from armscan.sweeps.scheduling.claim import ClaimStatus
 from armscan.sweeps.scheduling.race import Scores, race
 from armscan.sweeps.scheduling.scheduler import Plan, TrialScheduler
-from armscan.sweeps.scheduling.state import ClaimStatus, StudyState
+from armscan.sweeps.scheduling.state import StudyState
 from armscan.sweeps.space.parameter import Value
 from armscan.sweeps.study.arguments import fixed_by
 from armscan.sweeps.study.components import read_settings

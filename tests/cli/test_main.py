@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from subprocess import PIPE
 
 import click
 import pytest
@@ -103,6 +104,13 @@ def test_mistakes_and_interrupts_are_one_line(monkeypatch, capsys):
     assert capsys.readouterr().err == "error: a: is no volume\n"
     assert raising(monkeypatch, KeyboardInterrupt()) == 130
     assert capsys.readouterr().err == "\ninterrupted\n"
+
+
+def test_reader_that_has_ended_is_no_mistake(tmp_path):
+    list_runs = "import sys; from armscan.cli.main import main; sys.exit(main(['runs', 'list', '--format', 'csv']))"
+    with subprocess.Popen([sys.executable, "-c", list_runs], cwd=tmp_path, stdout=PIPE, stderr=PIPE) as process:
+        process.stdout.close()
+        assert b"Broken pipe" not in process.stderr.read()
 
 
 def test_faults_of_the_program_are_not_hidden(monkeypatch):

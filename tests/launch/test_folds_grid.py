@@ -101,6 +101,11 @@ def test_impossible_folds_are_refused_before_anything_runs(folder):
         with_folds(["data=nifti", "data.path=nowhere", "data.folds=2"])
 
 
+def test_several_numbers_of_folds_are_refused(folder):
+    with pytest.raises(InvalidValueError, match=r"data\.folds has several values"):
+        with_folds(["-m", "data=nifti", f"data.path={folder}", "data.folds=2,3"])
+
+
 def left_by_a_run(folder, volume, distances_mm):
     episodes = [episode_of(volume=volume, seed=i, distance_mm=mm) for i, mm in enumerate(distances_mm)]
     folder.mkdir()

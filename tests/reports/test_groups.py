@@ -79,6 +79,11 @@ def test_rules_that_differ_are_known(make_training, key, is_rule):
     assert differing_rules(groups) == ([key] if is_rule else [])
 
 
+def test_rule_that_another_key_refers_to_is_known(make_training):
+    groups, _ = group_trainings([make_training(params={"obs.targets": x, "reward.targets": x}) for x in "12"])
+    assert differing_rules(groups) == ["reward.targets"]
+
+
 def test_on_plane_rates_of_all_groups_have_the_limits_of_the_first(make_training):
     limits = ((5.0, 10.0), (2.0, 5.0))
     trainings = [

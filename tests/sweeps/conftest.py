@@ -9,8 +9,9 @@ import pytest
 from omegaconf import OmegaConf
 from optuna.trial import TrialState
 
+from armscan.sweeps.scheduling.claim import PendingWrites, TrialOutcome
+from armscan.sweeps.scheduling.limits import Limits
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import Limits, PendingWrites, TrialOutcome
 from armscan.sweeps.storage.attribute_names import FAILURE
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.open import open_for_work

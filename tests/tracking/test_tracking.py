@@ -137,6 +137,18 @@ def test_store_that_takes_long_is_waited_for_as_long_as_it_takes_entries(store, 
     assert clock_s[0] > 2 * 60.0
 
 
+def test_metrics_of_volumes_of_any_name_reach_the_store(store, tmp_path):
+    client, experiment_id = store
+    tracked = TrackedRun.start(client, experiment_id, name="n", config={}, tags={}, folder=tmp_path)
+    names = ["arm (1).nii.gz", "arm+1", "ä" * 300, "a/../b", "plain"]
+    tracked.log_metrics({f"test/volume/{name}/mean_steps": 1.0 for name in names}, n_env_steps=0)
+    assert tracked.end("FINISHED")
+    metrics = client.get_run(tracked.run_id).data.metrics
+    assert len(metrics) == len(names)
+    assert all(name.endswith("/mean_steps") and len(name) <= 250 for name in metrics)
+    assert "test/volume/plain/mean_steps" in metrics
+
+
 def test_description_of_a_person_stays_and_armscans_is_replaced(store):
     client, experiment_id = store
     run_id = client.create_run(experiment_id, name="n", tags={}).info.run_id
@@ -285,7 +297,8 @@ def test_run_that_goes_on_logs_what_is_missing_and_nothing_twice(store, tmp_path
     )
     first.on_epoch(REPORTS[0])
     first.end("KILLED", reason="interrupted")
-    config = {"seed": 3, "more": 4}
+    # MLflow would refuse another value of a parameter, and all entries after it.
+    config = {"seed": 5, "more": 4}
     run = client.get_run(first.run_id)
     second = TrackedRun.reopen(client, run, folder=tmp_path, config=config, tags={"folder": "there"})
     run = eventually(lambda: client.get_run(first.run_id), lambda run: "more" in run.data.params)

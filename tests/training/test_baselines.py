@@ -32,7 +32,7 @@ def test_sweep_stands_beside_random_planes_where_one_component_is_free(volumes, 
         list(evaluate_baselines(EnvFactory(projection=projection, max_steps=3).make_env(volumes), n_episodes=1, seed=0))
         for projection in ("y", ["rz"], "zy")
     ]
-    assert names == [["random", "sweep 5 mm"], ["random", "sweep 10°"], ["random"]]
+    assert names == [["random", "sweep 5 mm"], ["random", "sweep 10 deg"], ["random"]]
 
 
 def test_episodes_are_kept_for_the_same_volumes_and_rules_with_any_observation(volumes, played):

@@ -53,7 +53,8 @@ def print_result(opened: OpenedStudy) -> int:
         print_sentence(printable(told))
     elif len(state.finished) < settings.n_trials and (limit := settings.limit_reason(state)):
         print_sentence(f"the search has ended: {limit}")
-    if settings.constraints and state.finished and not best_trials(scheduler.study, 1):
+    is_any_complete = len(state.finished) > state.n_pruned
+    if settings.constraints and is_any_complete and not best_trials(scheduler.study, 1):
         print(f"no trial keeps all constraints: {', '.join(map(str, settings.constraints))}")
     _print_best(opened)
     code = 0 if opened.final_eval is None else _print_final_results(opened, opened.final_eval)

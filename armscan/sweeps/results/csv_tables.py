@@ -90,7 +90,7 @@ def _trial_row(trial: FrozenTrial, objectives: Sequence[str]) -> Row:
         **values,
         **({"feasible": is_feasible(trial)} if trial.constraints else {}),
         "seconds": seconds_of(trial),
-        "env_steps": trial.user_attrs.get(ENV_STEPS),
+        "env_steps_of_all_seeds": trial.user_attrs.get(ENV_STEPS),
         "retry_of": trial.user_attrs.get(RETRY_OF),
         **({"taken_from": trial.user_attrs[TAKEN_FROM]} if TAKEN_FROM in trial.user_attrs else {}),
         **{name: trial.user_attrs[name] for name in (MEMBER, GENERATION, PARENT) if name in trial.user_attrs},

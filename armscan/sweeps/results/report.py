@@ -135,7 +135,7 @@ def _trials(trials: Sequence[FrozenTrial], objectives: Sequence[str]) -> str:
                 **dict.fromkeys(map(title_of, objectives), ""),
                 **{title_of(name): value_text(name, value) for name, value in values},
                 **_settings(trial.params),
-                "environment steps": f"{env_steps_of(trial):,}",
+                "environment steps, all seeds": f"{env_steps_of(trial):,}",
                 "run": str(trial.user_attrs.get(RUN, ""))[:ID_CHARS],
             }
         )

@@ -109,8 +109,10 @@ def subjects_of(trial: FrozenTrial) -> dict[str, str]:
 
 
 def scores_of(name: str, of_seeds: Sequence[Mapping[str, float]]) -> tuple[list[str], NDArray[np.float64]]:
-    """Return the test volumes and a metric, shape (seeds, volumes); of all together if they are unknown."""
+    """Return the test volumes and a metric, shape (seeds, volumes): those of all trainings; all together if unknown."""
     metric = name.removeprefix(TEST_PREFIX)
+    common = set.intersection(*map(set, of_seeds))
+    # A volume may have been added while the study was interrupted.
     found = {match[1]: key for key in of_seeds[0] if (match := OF_VOLUME.fullmatch(key)) and match[2] == metric}
-    found = found or {"all": name}
+    found = {volume: key for volume, key in found.items() if key in common} if found else {"all": name}
     return [*found], np.array([[metrics[key] for key in found.values()] for metrics in of_seeds])

@@ -18,9 +18,10 @@ from optuna.samplers import RandomSampler
 from optuna.trial import FrozenTrial, Trial, TrialState
 
 from armscan.agents.schedule import FROM
-from armscan.sweeps.scheduling.state import FINISHED, PlannedTrial
+from armscan.sweeps.scheduling.claim import PlannedTrial
+from armscan.sweeps.scheduling.state import FINISHED, retried_by
 from armscan.sweeps.space.space import Space
-from armscan.sweeps.storage.attribute_names import GENERATION, INTERVAL, MEMBER, PARENT, RETRIED, RETRY_OF, SCHEDULE
+from armscan.sweeps.storage.attribute_names import GENERATION, INTERVAL, MEMBER, PARENT, RETRIED, SCHEDULE
 from armscan.utils.validation import check_float, check_int
 
 TRAINING_SCHEDULE = "training.schedule"
@@ -123,11 +124,12 @@ class Population:
         Args:
             trials: All trials of the study.
         """
-        trials = _members(trials)
+        everything, trials = trials, _members(trials)
         active = [trial for trial in trials if trial.state in ACTIVE]
         kept = {trial.number for trial in active}
         # A retry begins from the checkpoint of the attempt before, or from the same parent again.
-        kept |= {trial.user_attrs[name] for trial in active for name in (RETRY_OF, PARENT) if name in trial.user_attrs}
+        kept |= {number for trial in active for number in retried_by(trial, everything)}
+        kept |= {trial.user_attrs[PARENT] for trial in active if PARENT in trial.user_attrs}
         n_best = math.ceil(self.settings.quantile * self.settings.population)
         passed = {_place(trial) for trial in trials if trial.state in FINISHED}
         for generation in range(self.n_generations - 1):

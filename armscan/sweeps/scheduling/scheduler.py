@@ -15,16 +15,9 @@ from optuna.exceptions import UpdateFinishedTrialError
 from optuna.trial import FrozenTrial, Trial, TrialState
 
 from armscan.config.legacy import renamed
-from armscan.sweeps.scheduling.state import (
-    BEAT_S,
-    ClaimStatus,
-    Limits,
-    PendingWrites,
-    PlannedTrial,
-    StudyState,
-    TrialOutcome,
-    env_steps_of,
-)
+from armscan.sweeps.scheduling.claim import ClaimStatus, PendingWrites, PlannedTrial, TrialOutcome
+from armscan.sweeps.scheduling.limits import Limits
+from armscan.sweeps.scheduling.state import BEAT_S, StudyState, env_steps_of
 from armscan.sweeps.scheduling.termination import Termination
 from armscan.sweeps.storage.attribute_names import (
     ATTEMPT,

@@ -18,9 +18,10 @@ from pydantic import Field
 
 from armscan.config.legacy import renamed
 from armscan.errors import StudyError
+from armscan.sweeps.scheduling.claim import PlannedTrial
 from armscan.sweeps.scheduling.population import searched_values
 from armscan.sweeps.scheduling.race import MAX_SEEDS_FACTOR, Race, Scores, budget, race
-from armscan.sweeps.scheduling.state import CONTROL, PlannedTrial
+from armscan.sweeps.scheduling.state import CONTROL
 from armscan.sweeps.space.parameter import Value
 from armscan.sweeps.storage.attribute_names import FINAL_SEED, FINALIST, RESET_FAILURES, RETRIED, SCHEDULE
 from armscan.sweeps.storage.attributes import FINAL_SUFFIXES, JUDGEMENT_SUFFIX, SELECTION_SUFFIX, check_trials

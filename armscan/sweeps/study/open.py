@@ -12,8 +12,8 @@ import optuna
 from omegaconf import DictConfig
 
 from armscan.config.defaults import to_plain
+from armscan.sweeps.scheduling.limits import Limits
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import Limits
 from armscan.sweeps.scheduling.termination import Termination
 from armscan.sweeps.storage.attribute_names import STUDY_RUN
 from armscan.sweeps.storage.storage import Storage, open_storage

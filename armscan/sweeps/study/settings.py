@@ -11,8 +11,8 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from armscan.errors import InvalidValueError, listed
+from armscan.sweeps.scheduling.limits import Limits
 from armscan.sweeps.scheduling.race import MAX_SEEDS_FACTOR
-from armscan.sweeps.scheduling.state import Limits
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.storage.attributes import FINAL_SUFFIXES
 from armscan.sweeps.study.constraints import Constraint

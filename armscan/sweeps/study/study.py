@@ -42,7 +42,7 @@ def make_study(storage: Storage, settings: StudySettings, fixed: Mapping[str, An
         fixed: Configuration of its trials without the searched values; see `fixed_config`.
 
     Raises:
-        StudyError: If the study that exists searches another space, has other objectives, or has trials with another
+        StudyError: If the study that exists searches another space, has other objectives, or was started with another
             configuration.
     """
     wanted = comparable_settings(settings, fixed)
@@ -88,7 +88,8 @@ def existing_study(storage: Storage | None, settings: StudySettings, fixed: Mapp
         fixed: Configuration of its trials without the searched values.
 
     Raises:
-        StudyError: If the study searches another space, has other objectives, or has trials with another configuration.
+        StudyError: If the study searches another space, has other objectives, or was started with another
+            configuration.
     """
     study = storage.study(settings.name) if storage is not None else None
     if study is not None:
@@ -178,7 +179,7 @@ def _check_same(settings: StudySettings, study: optuna.Study, wanted: Mapping[st
     differences = _differences(*fixed_of(study, wanted))
     if differences and not settings.allow_config_changes:
         raise StudyError(
-            f"{whose} has trials with another configuration: {differences}; study.allow_config_changes=true accepts "
+            f"{whose} was started with another configuration: {differences}; study.allow_config_changes=true accepts "
             f"that{other}"
         )
     return bool(differences)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -199,8 +200,14 @@ def _not_searched(params: Mapping[str, Value], chosen: Mapping[str, Value], fixe
 
 def _plain(flat: Mapping[str, Any]) -> dict[str, Value]:
     """Return the values of a flattened configuration, whose lists are JSON, as Optuna stores them."""
-    is_list = {key: isinstance(value, str) and value.startswith("[") for key, value in flat.items()}
-    return {key: optuna_value(json.loads(value) if is_list[key] else value) for key, value in flat.items()}
+    return {key: optuna_value(_listed(value)) for key, value in flat.items()}
+
+
+def _listed(value: Any) -> Any:
+    """Return the list that a value describes; the value itself if it describes none, such as the text `[a] b`."""
+    with contextlib.suppress(ValueError):
+        return json.loads(value) if isinstance(value, str) and value.startswith("[") else value
+    return value
 
 
 def first_different(settings: Iterable[dict[str, Value]]) -> tuple[dict[str, Value], ...]:

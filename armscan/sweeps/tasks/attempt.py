@@ -17,8 +17,9 @@ from omegaconf import DictConfig, OmegaConf
 from optuna.trial import Trial
 
 from armscan.errors import InvalidValueError, listed
-from armscan.sweeps.scheduling.state import PendingWrites
-from armscan.sweeps.storage.attribute_names import ENV_STEPS, EPISODES, INTERVAL, PARENT, RETRY_OF, RUN, SEEDS
+from armscan.sweeps.scheduling.claim import PendingWrites
+from armscan.sweeps.scheduling.state import retried_by
+from armscan.sweeps.storage.attribute_names import ENV_STEPS, EPISODES, INTERVAL, PARENT, RUN, SEEDS
 from armscan.sweeps.storage.reports import reports_of, store_report
 from armscan.tracking import TrackedRun
 from armscan.training import Evaluation, Split
@@ -63,13 +64,14 @@ class Attempt:
     show_picture: Callable[[Path], None]
     writes: PendingWrites
     transaction: Callable[[Callable[[], bool]], bool]
-    env_steps: int = field(default=0, init=False)
+    env_steps: int = field(init=False)
     _of_seeds: dict[str, Mapping[str, float]] = field(init=False)
     # Steps that have been reported, including those before the trial was requeued.
     _reported: set[int] = field(init=False)
 
     def __post_init__(self) -> None:
         self._of_seeds = dict(self.trial.user_attrs.get(SEEDS, {}))
+        self.env_steps = sum(int(one.get(ENV_STEPS, 0)) for one in self._of_seeds.values())
         is_resumed = RUN in self.trial.user_attrs
         self._reported = set(reports_of(self.trial.storage.get_trial(self.trial._trial_id))) if is_resumed else set()
 
@@ -79,10 +81,10 @@ class Attempt:
         return trial_folder(self.study_folder, self.trial.number)
 
     @property
-    def folder_before(self) -> Path | None:
-        """Folder of the attempt that it replaces; None for the first attempt."""
-        number = self.trial.user_attrs.get(RETRY_OF)
-        return None if number is None else trial_folder(self.study_folder, number)
+    def folders_before(self) -> list[Path]:
+        """Folders of the attempts that it replaces, the latest first."""
+        trials = self.trial.study.get_trials(deepcopy=False)
+        return [trial_folder(self.study_folder, number) for number in retried_by(self.trial, trials)]
 
     @property
     def parent_folder(self) -> Path | None:
@@ -152,7 +154,7 @@ class Attempt:
         Raises:
             optuna.TrialPruned: If the trial is pruned.
         """
-        done = [one for each, one in self.seeds_done.items() if each in self.seeds]
+        done = [one for each, one in self.seeds_done.items() if each in self.seeds and each != seed]
         self.env_steps = sum(int(one[ENV_STEPS]) for one in done) + n_env_steps - n_inherited_env_steps
         progress = {"seed": seed, ENV_STEPS: self.env_steps}
         self.report_progress(progress | ({"return": metrics["mean_return"]} if "mean_return" in metrics else {}))

@@ -22,6 +22,7 @@ from armscan.experiment.provenance import place_tags, start_tracking, volume_tag
 from armscan.experiment.results import RunResult
 from armscan.experiment.runner import VIDEO_SEED, log_result, train_agent
 from armscan.stats.bootstrap import interquartile_mean, mean
+from armscan.sweeps.scheduling.limits import LimitReachedError
 from armscan.sweeps.scheduling.state import TEST_PREFIX
 from armscan.sweeps.tasks.attempt import Attempt, volumes_of
 from armscan.sweeps.tasks.generation import begin_generation
@@ -78,7 +79,9 @@ class TrainingTask:
         For `solved`, a share of the seeds, return the mean.
         """
         for seed in attempt.seeds:
-            if seed not in attempt.seeds_done:
+            # In a population, the next generation begins from this folder, and not from that of an earlier attempt.
+            is_elsewhere = attempt.interval is not None and not (_folder_of(attempt, seed) / RUN_FILE).exists()
+            if seed not in attempt.seeds_done or is_elsewhere:
                 attempt.keep_seed(seed, _train(attempt, seed))
         of_seeds = [attempt.seeds_done[seed] for seed in attempt.seeds]
         scores = {name: np.array([metrics[name] for metrics in of_seeds]) for name in of_seeds[0]}
@@ -132,11 +135,15 @@ def _evaluate_on_test(
     return metrics
 
 
+def _folder_of(attempt: Attempt, seed: int) -> Path:
+    return attempt.folder / f"seed_{seed}"
+
+
 def _train(attempt: Attempt, seed: int, conclude: Conclude | None = None) -> dict[str, float]:
     """Train with one seed, from the last checkpoint if there is one; return metrics, including those of `conclude`."""
     config, choices = attempt.config(seed)
     setup = set_up(config)
-    folder = attempt.folder / f"seed_{seed}"
+    folder = _folder_of(attempt, seed)
     folder.mkdir(parents=True, exist_ok=True)
     reporter = Reporter(attempt, seed, setup.budget)
     pruned, concluded = None, {}
@@ -157,6 +164,9 @@ def _train(attempt: Attempt, seed: int, conclude: Conclude | None = None) -> dic
             except optuna.TrialPruned as error:
                 pruned = error
                 tracked.set_pruned()
+            except LimitReachedError:
+                tracked.end_requeued()
+                raise
             else:
                 concluded = conclude(setup, result, tracked, folder) if conclude else {}
             draw_learning_curve(reporter.reports, folder / LEARNING_CURVE_FILE, title=tracked.name)
@@ -173,11 +183,13 @@ def _start_or_resume(
     attempt: Attempt, setup: Experiment, config: DictConfig, choices: dict[str, str], folder: Path
 ) -> tuple[Experiment, TrackedRun, list[EpochReport]]:
     """Open the tracked run of a training, and restore the agent as an earlier attempt left it."""
-    agent, before = setup.agent, attempt.folder_before
+    agent = setup.agent
     assert isinstance(agent, Learner)
     found = _begun_in(folder, attempt, config)
-    if found is None and before is not None and (found := _begun_in(before / folder.name, attempt, config)):
-        _take_over(found[1].info.run_id, before / folder.name, folder)
+    for before in attempt.folders_before if found is None else ():
+        if found := _begun_in(before / folder.name, attempt, config):
+            _take_over(found[1].info.run_id, before / folder.name, folder)
+            break
     if found is not None and (folder / LAST_CHECKPOINT).exists():
         client, run = found
         try:

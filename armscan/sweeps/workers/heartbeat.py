@@ -12,8 +12,10 @@ from typing import Any
 import optuna
 from optuna.trial import FrozenTrial, Trial
 
+from armscan.sweeps.scheduling.claim import PendingWrites, TrialOutcome
+from armscan.sweeps.scheduling.limits import LimitReachedError
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import BEAT_S, PendingWrites, TrialOutcome
+from armscan.sweeps.scheduling.state import BEAT_S
 from armscan.sweeps.storage.attribute_names import HOLDER, LEASE, STOP
 from armscan.utils.log import log
 from armscan.utils.processes import ProcessInfo
@@ -32,10 +34,6 @@ REQUEUE_TIMEOUT_S = 5.0
 # Part of it: the longest wait for a tracked run that is being created. Requeued before the run's ID is stored, a trial
 # would get a second run.
 OPENING_TIMEOUT_S = 2.0
-
-
-class LimitReachedError(Exception):
-    """The study's time or environment steps are used up, or it was stopped: the current trial is requeued."""
 
 
 class LivenessCheck:

@@ -8,14 +8,13 @@ from typing import Any
 
 from optuna.trial import Trial
 
-from armscan.sweeps.scheduling.state import PendingWrites
+from armscan.sweeps.scheduling.claim import PendingWrites
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.attribute_names import RETRY_OF, RUN
 from armscan.sweeps.study.dashboard import note_run
 from armscan.sweeps.study.phase import Phase
 from armscan.sweeps.tasks.attempt import trial_folder
 from armscan.tracking import TrackedRun, run_of_study
-from armscan.tracking.run import SHORT_WAIT_S
 from armscan.tracking.tags import FOLDER_TAG, PARENT_TAG, STUDY_TAG, TRIAL_TAG
 from armscan.utils.run_files import CONFIG_FILE, SHA256_TAGS
 
@@ -71,4 +70,4 @@ def open_run(
 def close_requeued(*runs: TrackedRun | None) -> None:
     """Close the open runs of a trial that is requeued; None for no run."""
     for run in filter(None, runs):
-        run.end("KILLED", reason="requeued", wait_s=SHORT_WAIT_S)
+        run.end_requeued()

@@ -18,8 +18,9 @@ from armscan.config.compose import compose_run
 from armscan.config.defaults import MULTIRUN, to_plain
 from armscan.config.error_messages import one_line_message
 from armscan.errors import FolderInUseError, StorageUnavailableError, TrackingUnavailableError
+from armscan.sweeps.scheduling.claim import ClaimStatus, TrialOutcome
+from armscan.sweeps.scheduling.limits import LimitReachedError
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import ClaimStatus, TrialOutcome
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.attribute_names import CONFIG_SHA256, ENV_STEPS, FAILURE, FOLDER, METRICS, RUN
 from armscan.sweeps.study.components import make, read_settings
@@ -27,7 +28,7 @@ from armscan.sweeps.study.dashboard import named_as_of_runs, note_run, show_pict
 from armscan.sweeps.study.open import open_for_work
 from armscan.sweeps.study.phase import Phase
 from armscan.sweeps.tasks.attempt import Attempt, check_metrics, config_sha256, trial_folder
-from armscan.sweeps.workers.heartbeat import Heartbeat, LimitReachedError
+from armscan.sweeps.workers.heartbeat import Heartbeat
 from armscan.sweeps.workers.trial_run import close_requeued, open_run
 from armscan.tracking import TrackedRun
 from armscan.utils.log import log, silence_libraries
@@ -168,7 +169,9 @@ class Worker:
         try:
             return phase.run(attempt)
         finally:
-            writes.append(partial(trial.set_user_attr, ENV_STEPS, attempt.env_steps))
+            # A resumed trial may be requeued again before it gets as far as before.
+            n_env_steps = max(attempt.env_steps, int(trial.user_attrs.get(ENV_STEPS, 0)))
+            writes.append(partial(trial.set_user_attr, ENV_STEPS, n_env_steps))
             if attempt.seeds_done:
                 where = phase.client, phase.experiment_id, self._tracked.run_id, folder
                 writes.append(partial(note_run, trial, *where, table_of_seeds(attempt.seeds_done)))

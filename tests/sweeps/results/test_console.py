@@ -6,7 +6,8 @@ import pytest
 from optuna.trial import TrialState
 
 from armscan.sweeps.results.console import print_result
-from armscan.sweeps.scheduling.state import CONTROL, FAILURES_AT_ONCE
+from armscan.sweeps.scheduling.limits import FAILURES_AT_ONCE
+from armscan.sweeps.scheduling.state import CONTROL
 from armscan.sweeps.storage.attribute_names import ENV_STEPS, FINAL_SEED, FINALIST, METRICS
 from armscan.sweeps.study.settings import FinalEvalSettings
 

@@ -9,8 +9,8 @@ import optuna
 import pytest
 from PIL import Image
 
+from armscan.sweeps.scheduling.limits import Limits
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import Limits
 from armscan.sweeps.storage.storage import open_storage
 from tests.reports.conftest import rows
 from tests.sweeps.conftest import fail
@@ -98,6 +98,14 @@ def test_report_is_one_page_with_every_number_beside_it(answer, tmp_path):
     assert (steps["figure"], float(steps["value"]), success["value"]) == ("test/mean_steps", 2.5, "1.0")
     assert float(steps["low"]) < 2.5 < float(steps["high"])
     assert [row["key"] for row in rows(folder / "importances.csv")] == ["agent.lr"]
+
+
+def test_objective_env_steps_is_not_taken_for_the_steps_of_all_seeds(answer, tmp_path):
+    searched(tmp_path, ["env_steps"])
+    answer("--study=a")
+    first, *_ = rows(tmp_path / "reports" / "a" / "trials.csv")
+    assert first["env_steps"] == first["agent.lr"]
+    assert first["env_steps_of_all_seeds"] == "0"
 
 
 @pytest.mark.parametrize(("objectives", "n_trials"), [(["mean_steps", "env_steps"], 6), (["mean_steps"], 0)])

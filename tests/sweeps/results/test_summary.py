@@ -122,6 +122,13 @@ def test_episodes_that_a_stranger_has_written_are_one_line(kept):
         final_results([trial])
 
 
+def test_scores_are_of_the_volumes_that_all_trainings_have():
+    metrics = {"test/mean_steps": 2.0, **{f"test/volume/{name}/mean_steps": 1.0 for name in "abc"}}
+    added = {key: value for key, value in metrics.items() if key != "test/volume/b/mean_steps"}
+    volumes, scores = scores_of("test/mean_steps", [metrics, added])
+    assert (volumes, scores.shape) == (["a", "c"], (2, 2))
+
+
 @pytest.mark.parametrize("metric", ["mean_steps", "on_plane_5mm_10deg", "on_plane_2.5mm_5deg"])
 def test_scores_are_of_each_volume_whatever_the_name_of_the_metric(metric):
     of_volumes = [f"test/volume/a/b/{metric}", f"test/volume/c/{metric}"]

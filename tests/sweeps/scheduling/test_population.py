@@ -10,9 +10,10 @@ from optuna.distributions import CategoricalDistribution, FloatDistribution, Int
 from optuna.trial import TrialState
 
 from armscan.errors import StudyError
+from armscan.sweeps.scheduling.claim import PendingWrites, TrialOutcome
+from armscan.sweeps.scheduling.limits import Limits
 from armscan.sweeps.scheduling.population import Population, PopulationSampler, _perturb, lineage, searched_values
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import Limits, PendingWrites, TrialOutcome
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.storage.attribute_names import LEASE

@@ -6,12 +6,14 @@ import random
 import signal
 import time
 from dataclasses import asdict
+from datetime import datetime, timedelta
 
 import optuna
 import pytest
-from optuna.trial import TrialState
+from optuna.trial import TrialState, create_trial
 
-from armscan.sweeps.scheduling.state import PlannedTrial, StudyState, seconds_of
+from armscan.sweeps.scheduling.claim import PlannedTrial
+from armscan.sweeps.scheduling.state import StudyState, retried_by, seconds_of
 from armscan.sweeps.storage.attribute_names import (
     ATTEMPT,
     EARLIER_SPANS,
@@ -22,6 +24,7 @@ from armscan.sweeps.storage.attribute_names import (
     RETRIED,
     RETRY_OF,
     STOP,
+    TAKEN_FROM,
 )
 from armscan.sweeps.workers import heartbeat as lease_module
 from armscan.sweeps.workers.heartbeat import Heartbeat, LivenessCheck
@@ -366,6 +369,33 @@ def test_time_before_a_trial_was_requeued_is_counted_once_another_worker_has_it(
     ((start_s, end_s),) = finished.user_attrs[EARLIER_SPANS]
     assert end_s - start_s >= 0.1
     assert seconds_of(finished) == pytest.approx(end_s - start_s + finished.duration.total_seconds(), abs=1e-5)
+
+
+def test_attempts_that_a_retry_replaces_are_known_however_many(make_scheduler):
+    scheduler = make_scheduler(max_retries=3)
+    for _ in range(2):
+        scheduler.claim({"worker": "a"})
+        scheduler.reclaim(lambda _: True)
+    retry = scheduler.claim({"worker": "a"})
+    assert list(retried_by(retry, scheduler.study.get_trials(deepcopy=False))) == [1, 0]
+
+
+@pytest.mark.parametrize(("hours", "spent_h"), [((1.5, 3.5), 1.0), ((5.0, 6.0), 1.0)], ids=["over", "after"])
+def test_time_is_counted_rightly_when_clocks_are_put_forward(monkeypatch, hours, spent_h):
+    monkeypatch.setenv("TZ", "Europe/Berlin")
+    time.tzset()
+    try:
+        start, end = (datetime(2026, 3, 29) + timedelta(hours=each) for each in hours)
+        trial = create_trial(value=1.0)
+        trial.datetime_start, trial.datetime_complete = start, end
+        assert StudyState.of([trial]).busy_hours == seconds_of(trial) / 3600 == spent_h
+    finally:
+        monkeypatch.undo()
+        time.tzset()
+
+
+def test_trial_of_another_study_has_taken_no_time_here():
+    assert seconds_of(create_trial(value=1.0, user_attrs={TAKEN_FROM: "a:0"})) is None
 
 
 def test_failures_of_final_trainings_that_had_begun_to_train_do_not_end_them(make_scheduler):

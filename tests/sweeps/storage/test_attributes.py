@@ -9,8 +9,8 @@ from optuna.trial import TrialState, create_trial
 
 from armscan.errors import ArmscanError
 from armscan.sweeps.results.report import write_report
+from armscan.sweeps.scheduling.limits import Limits
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import Limits
 from armscan.sweeps.storage import attribute_names as names
 from armscan.sweeps.storage.attribute_names import (
     FINAL_SEED,

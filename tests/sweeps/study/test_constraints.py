@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from armscan.errors import InvalidValueError
-from armscan.sweeps.scheduling.state import PendingWrites, is_feasible
+from armscan.sweeps.scheduling.claim import PendingWrites
+from armscan.sweeps.scheduling.state import is_feasible
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.components import read_settings
 from armscan.sweeps.study.constraints import Constraint, constrained

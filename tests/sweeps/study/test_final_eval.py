@@ -14,9 +14,10 @@ from armscan.stats.bootstrap import Estimate
 from armscan.sweeps.results.judgement import COMPARISONS, Difference, Judgement, best_metrics, judge, result_note
 from armscan.sweeps.results.progress import final_line
 from armscan.sweeps.results.selection import candidates_of
+from armscan.sweeps.scheduling.limits import Limits
 from armscan.sweeps.scheduling.population import searched_values
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import CONTROL, Limits
+from armscan.sweeps.scheduling.state import CONTROL
 from armscan.sweeps.stop import stop_trial
 from armscan.sweeps.storage.attribute_names import FINALIST, GENERATION, MEMBER, METRICS, RETRIED, SCHEDULE
 from armscan.sweeps.storage.storage import open_storage

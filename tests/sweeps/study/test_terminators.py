@@ -11,8 +11,9 @@ from optuna.study import StudyDirection
 from optuna.trial import create_trial
 
 from armscan.errors import InvalidValueError
+from armscan.sweeps.scheduling.limits import Limits
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import Limits, StudyState
+from armscan.sweeps.scheduling.state import StudyState
 from armscan.sweeps.scheduling.termination import Termination, ended_because, reopen
 from armscan.sweeps.storage.attribute_names import SEEDS, TAKEN_FROM
 from armscan.sweeps.storage.storage import open_storage

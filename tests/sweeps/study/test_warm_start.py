@@ -7,8 +7,9 @@ from optuna.trial import TrialState
 from armscan.config.defaults import to_plain
 from armscan.config.sources import sweeps_folder
 from armscan.errors import StudyError
+from armscan.sweeps.scheduling.limits import Limits
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import CONTROL, Limits, StudyState
+from armscan.sweeps.scheduling.state import CONTROL, StudyState
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.storage.attribute_names import TAKEN_FROM
 from armscan.sweeps.storage.storage import open_storage
@@ -54,6 +55,13 @@ def begin(made, fixed=FIXED):
     for each in initial:
         assert each.add(storage, study)
     return [each.message for each in initial]
+
+
+def test_text_that_looks_like_a_list_is_a_text(study_in):
+    fixed = FIXED | {"data": {"path": "[lab] volumes"}}
+    study_in("before", {"agent.lr": LR}, fixed, rows=[({"agent.lr": 1e-3}, 3.0)])
+    (message,) = begin(study_in("after", {"agent.lr": LR}, fixed, warm_start=("before",)), fixed)
+    assert "1 taken with their values" in message
 
 
 def test_trials_of_the_same_configuration_are_taken_with_their_values_and_count_nowhere(study_in):

@@ -6,8 +6,19 @@ from types import SimpleNamespace
 import pytest
 from omegaconf import OmegaConf
 
+from armscan.sweeps.tasks import training
 from armscan.sweeps.tasks.training import _begun_in
 from armscan.tracking import open_store
+
+
+@pytest.mark.parametrize("interval", [None, (0, 400)], ids=["whole", "generation"])
+def test_seed_of_an_earlier_attempt_is_gone_on_with_where_the_next_generation_needs_it(tmp_path, monkeypatch, interval):
+    trained = []
+    monkeypatch.setattr(training, "_train", lambda attempt, seed: trained.append(seed) or {"mean_steps": 1.0})
+    attempt = SimpleNamespace(seeds=(0, 1), seeds_done={0: {"mean_steps": 2.0}}, folder=tmp_path, interval=interval)
+    attempt.keep_seed = attempt.seeds_done.__setitem__
+    training.TrainingTask().run(attempt)
+    assert trained == ([1] if interval is None else [0, 1])
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,9 @@ import optuna
 import pytest
 from optuna.trial import TrialState
 
+from armscan.sweeps.scheduling.claim import PlannedTrial
+from armscan.sweeps.scheduling.limits import Limits
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import Limits, PlannedTrial
 from armscan.sweeps.storage.attribute_names import FINAL_SEED, FINALIST, METRICS, STOP
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.workers import monitor as module

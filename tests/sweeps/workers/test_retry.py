@@ -17,8 +17,9 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from armscan.errors import StorageUnavailableError
 from armscan.sweeps.results import progress as screen
+from armscan.sweeps.scheduling.claim import PendingWrites, TrialOutcome
+from armscan.sweeps.scheduling.limits import Limits
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import Limits, PendingWrites, TrialOutcome
 from armscan.sweeps.storage.attribute_names import LEASE, RETRY_OF
 from armscan.sweeps.storage.database import unavailable_reason
 from armscan.sweeps.storage.storage import open_storage

@@ -14,8 +14,10 @@ import optuna
 import pytest
 
 from armscan.errors import FolderInUseError, InvalidValueError
+from armscan.sweeps.scheduling.claim import PlannedTrial
+from armscan.sweeps.scheduling.limits import Limits
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import CONTROL, Limits, PlannedTrial
+from armscan.sweeps.scheduling.state import CONTROL
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.stop import stop_study, stop_trial
 from armscan.sweeps.storage.attribute_names import FINAL_SEED, FINALIST, LEASE, METRICS, RUN, STOP
