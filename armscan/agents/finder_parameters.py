@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import ClassVar
 
-from armscan.agents.hyperparameters import number
+from armscan.agents.hyperparameters import check_numbers_of, number
 from armscan.errors import InvalidValueError
-from armscan.utils.validation import check_bool, check_float, check_int, check_ints, check_numbers
+from armscan.utils.validation import check_float, check_ints, check_numbers
 
 MAX_LOOKS, MAX_OFFSET_MM, MAX_UNITS = 20, 100.0, 4096
 N_CONVOLUTIONS = 3
@@ -89,12 +89,7 @@ class FinderParameters:
     """
 
     def __post_init__(self) -> None:
-        for each in fields(self):
-            if "limits" in each.metadata:
-                check_float(f"agent.{each.name}", getattr(self, each.name), **each.metadata["limits"])
-        for name in ("num_envs", "n_seen", "n_averaged"):
-            check_int(f"agent.{name}", getattr(self, name), at_least=1)
-        check_bool("agent.average_tilts", self.average_tilts)
+        check_numbers_of(self)
         for name, n_sizes in (("filters", N_CONVOLUTIONS), ("hidden_sizes", None)):
             check_ints(f"agent.{name}", getattr(self, name), n_sizes, "", at_least=1, at_most=MAX_UNITS)
         n_offsets = len(self.offsets_mm) if isinstance(self.offsets_mm, list | tuple) else 0

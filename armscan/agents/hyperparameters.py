@@ -16,6 +16,22 @@ def number(default: float, **limits: float) -> Any:
     return field(default=default, metadata={"limits": limits})
 
 
+def check_numbers_of(parameters: Any) -> None:
+    """Raise `InvalidValueError` unless the whole numbers, truth values and numbers of an algorithm are allowed.
+
+    Args:
+        parameters: Hyperparameters, a dataclass. Fields of other types are not checked.
+    """
+    for each in fields(parameters):
+        name, value = f"agent.{each.name}", getattr(parameters, each.name)
+        if each.type == "int":
+            check_int(name, value, at_least=1)
+        elif each.type == "bool":
+            check_bool(name, value)
+        elif each.type == "float":
+            check_float(name, value, **each.metadata["limits"])
+
+
 @dataclass(frozen=True, kw_only=True)
 class Parameters:
     """Hyperparameters of every learning algorithm.
@@ -46,14 +62,7 @@ class Parameters:
 
     def __post_init__(self) -> None:
         check_network(self.network)
-        for each in fields(self):
-            name, value = f"agent.{each.name}", getattr(self, each.name)
-            if each.type == "int":
-                check_int(name, value, at_least=1)
-            elif each.type == "bool":
-                check_bool(name, value)
-            elif each.type == "float":
-                check_float(name, value, **each.metadata["limits"])
+        check_numbers_of(self)
 
     def lr_after(self, n_env_steps: int, total_env_steps: int) -> float:
         """Return the learning rate after `n_env_steps`: linear from `lr` to `lr_end_factor` times as much."""

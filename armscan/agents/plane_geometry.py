@@ -143,7 +143,7 @@ def common_geometry(rules: Rules, n_looks: int) -> PlaneGeometry:
             f"the bounds of translations are {sizes} mm, but agent=plane_finder needs the same on all volumes: give "
             "env.translation_bounds_mm"
         )
-    middles = np.array([[volume.centre_mm[0], volume.centre_mm[2]] for volume in rules.volumes.values()])
+    middles = np.array([volume.slice_centre_mm for volume in rules.volumes.values()])
     return PlaneGeometry(bounds.pop(), middles.mean(axis=0).tolist())
 
 

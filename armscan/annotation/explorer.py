@@ -15,7 +15,7 @@ from armscan.anatomy import SUCCESS_THRESHOLD, Tissues, check_tissues
 from armscan.envs.actions import COMPONENTS
 from armscan.envs.observations import View
 from armscan.envs.panels import BACKGROUND, INK, LINE_INK, OPTIMUM_INK, PLANE_INK, Ink
-from armscan.envs.rendering import HEIGHT, WIDTH, History, ReferencePlane, draw_plane, view_of
+from armscan.envs.rendering import HEIGHT, WIDTH, Box, History, ReferencePlane, draw_plane, view_of
 from armscan.envs.rules import Volumes, named_volumes
 from armscan.envs.scene import SceneSampler
 from armscan.envs.window import check_display, opened
@@ -29,7 +29,6 @@ N_REMEMBERED = 60
 HEIGHT_BELOW = 148
 SLIDERS_AT, SLIDER_GAP = (64, 116, 400, 18), 34
 BUTTONS_AT, BUTTON_GAP = (640, 104, 204, 32), 44
-Box = tuple[int, int, int, int]
 
 
 class Explorer:

@@ -159,7 +159,7 @@ def _evaluate(
     """Evaluate an agent, track its metrics, and print them."""
     from armscan.evaluation import report_tables
     from armscan.evaluation.track import evaluate_and_track
-    from armscan.experiment.console import print_table, print_where_to_look
+    from armscan.experiment.console import print_result_table, print_where_to_look
     from armscan.utils.console import wide_console
 
     report, file = evaluate_and_track(prepared, store, n_episodes=n_episodes, seed=seed, changes=changes, out=out)
@@ -168,7 +168,7 @@ def _evaluate(
         console.print(part)
     tables = report.tables()
     for label, table in tables.items():
-        print_table(label, table, how=label == [*tables][-1])
+        print_result_table(label, table, how=label == [*tables][-1])
     print_where_to_look(Path.cwd(), store["uri"], files=(str(file),))
 
 

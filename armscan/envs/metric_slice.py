@@ -9,13 +9,13 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from armscan.envs.observations import SliceGeometry, View
+from armscan.envs.slice_observations import LONGEST_SIDE_PX
 from armscan.envs.spaces import Parts
 from armscan.errors import InvalidValueError
 from armscan.utils.compilation import cached_njit
 from armscan.utils.validation import check_float, check_numbers
 from armscan.volumes import LANDMARK_LABELS
 
-LONGEST_SIDE_PX = 4096
 # The highest value of a pixel: all of it is of the tissue.
 FULL = 255
 # Relative tolerance for the field of view to be a whole number of pixels.

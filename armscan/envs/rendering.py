@@ -163,8 +163,7 @@ def _write_facts(
         f"tx {tx:.1f} mm, ty {ty:.1f} mm",
     ]
     if beside is not None:
-        centre_mm = volume.centre_mm
-        distance_mm, distance_deg = plane_distance(plane, beside.action, (centre_mm[0], centre_mm[2]))
+        distance_mm, distance_deg = plane_distance(plane, beside.action, volume.slice_centre_mm)
         lines += [f"{distance_mm:.1f} mm and {distance_deg:.1f}°", f"from the {beside.name}"]
     for row, line in enumerate(lines):
         draw.text((x, y + 38 + 22 * row), _shortened(line), fill=INK, font=font(15))

@@ -90,7 +90,7 @@ class RandomTransform:
             (tx, ty),
             centre_mm,
             plane=volume.optimal_action,
-            about_mm=(volume.centre_mm[0], volume.centre_mm[2]),
+            about_mm=volume.slice_centre_mm,
             deformation=self._deformation(rng),
         )
 
@@ -137,8 +137,7 @@ class Scene:
 
     def distance(self, action: ManipulatorAction) -> tuple[float, float]:
         """Return how far a plane is from the optimal one, as `plane_distance` does: (mm, degrees)."""
-        centre_mm = self.volume.centre_mm
-        return plane_distance(action, self.optimum, (centre_mm[0], centre_mm[2]))
+        return plane_distance(action, self.optimum, self.volume.slice_centre_mm)
 
 
 @dataclass(frozen=True, kw_only=True)

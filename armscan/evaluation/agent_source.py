@@ -14,8 +14,8 @@ from armscan.config.compose import compose
 from armscan.config.defaults import CHANGES
 from armscan.errors import CheckpointError, InvalidValueError
 from armscan.experiment.build import check_keys, check_sections
-from armscan.tracking.lookup import FoundRun, load_run
-from armscan.tracking.tags import DOMAIN_TAG, EVALUATED_TAG
+from armscan.tracking.lookup import FoundRun, load_agent_run
+from armscan.tracking.tags import DOMAIN_TAG
 from armscan.training import CheckpointProvenance, Fingerprints, TrainingDomain, load_weights
 
 # Keys of the section `data` that hold paths.
@@ -57,9 +57,7 @@ def agent_of_run(tracking: str, run_id: str, changes: Mapping[str, Any], *, trus
     Raises:
         ArmscanError: If there is no such run, or its artifacts are missing or damaged.
     """
-    run = load_run(tracking, run_id)
-    if EVALUATED_TAG in run.tags:
-        raise InvalidValueError(f"run is {run_id!r}, but that is an evaluation, of {run.tags[EVALUATED_TAG]}")
+    run = load_agent_run(tracking, run_id)
     with tempfile.TemporaryDirectory() as folder:
         config = from_its_folder(changed(OmegaConf.create(run.config(Path(folder), trust=trust)), changes), run.tags)
         weights, facts = _weights(run, Path(folder))

@@ -19,7 +19,7 @@ from armscan.utils.console import print_sentence, wide_console
 from armscan.utils.run_files import ID_CHARS
 
 
-def print_table(title: str, table: ResultTable, notes: Iterable[str] = (), *, how: bool = True) -> None:
+def print_result_table(title: str, table: ResultTable, notes: Iterable[str] = (), *, how: bool = True) -> None:
     """Print a table of results that fits the terminal.
 
     Args:
@@ -48,7 +48,7 @@ def print_jobs(outcomes: Mapping[str, JobOutcome], run_ids: Mapping[str, str]) -
         run_ids: MLflow run ID of each job that started a run, by its number.
     """
     table = jobs_table(outcomes, run_ids)
-    print_table(f"jobs ({TEST})", table)
+    print_result_table(f"jobs ({TEST})", table)
     return table
 
 

@@ -13,7 +13,7 @@ from omegaconf import DictConfig
 from armscan.agents import Learner
 from armscan.config.command_hints import armscan_command, resume_command
 from armscan.experiment.build import Experiment, check_keys, set_up
-from armscan.experiment.console import print_table, print_where_to_look
+from armscan.experiment.console import print_result_table, print_where_to_look
 from armscan.experiment.job import Invocation
 from armscan.experiment.provenance import start_tracking
 from armscan.experiment.results import RunResult
@@ -114,7 +114,7 @@ def run_tracked(
         if job_label is None:
             policy = f"{how} policy" if how else "policy"
             origin = f"{policy}, as it was after {result.best.n_env_steps} steps" if result else "nothing to learn"
-            print_table(f"results ({origin})", reached.table(), reached.notes())
+            print_result_table(f"results ({origin})", reached.table(), reached.notes())
         tell("writing the results, the video of an episode, and the policy")
         record_episode(setup.agent, setup.video_env, folder / VIDEO_FILE, seed=VIDEO_SEED + setup.seed)
         keep_results(tracked, result, reached, folder)

@@ -235,7 +235,7 @@ def _pool_folds(
     store: TrackingStore,
 ) -> bool:
     """Print one table over all folds of a cross-validation, and save it above the table of the jobs; False without."""
-    from armscan.experiment.console import print_table
+    from armscan.experiment.console import print_result_table
     from armscan.launch.folds_table import folds_table, keep_table
 
     finished = [run for run in runs if outcomes[run.data.tags[JOB_TAG]].failure is None]
@@ -247,7 +247,7 @@ def _pool_folds(
         f"{left_out} of {len(outcomes)} jobs are missing: the table is over the folds that all seeds were tested on"
     )
     notes = [missing] if left_out else []
-    print_table("all folds (test)", table, notes)
+    print_result_table("all folds (test)", table, notes)
     keep_table(table, jobs, folder, store, parent["run_id"], notes)
     return True
 

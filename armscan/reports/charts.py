@@ -16,6 +16,7 @@ from armscan.reports.chart_style import GREY, RATE_AXIS, mode
 from armscan.reports.curves import AXES, NOTHING, Curve
 from armscan.reports.groups import Group
 from armscan.stats.aggregation import MIN_SEEDS
+from armscan.stats.bootstrap import Estimate
 from armscan.training import MetricEstimates
 from armscan.training.metric_display import is_rate, title_of
 from armscan.utils.text import counted
@@ -106,6 +107,48 @@ def learning_curves(
     return figure
 
 
+def add_estimate(
+    figure: Figure,
+    label: str,
+    colour: str,
+    estimate: Estimate,
+    scores: Mapping[str, float],
+    hover: str,
+    name: str = "",
+    **where: int,
+) -> None:
+    """Add an estimate with its interval to a chart, and a dot for each seed.
+
+    Args:
+        figure: Chart to add to.
+        label: Its place on the vertical axis.
+        colour: Colour of the estimate and the dots.
+        estimate: Estimate to add.
+        scores: Score of each seed, by its name.
+        hover: Plotly's template of the text beside the pointer.
+        name: Text in the box behind the score of a seed. Default: none.
+        **where: Row and column of a subplot.
+    """
+    value, low, high = estimate
+    of_both = {"mode": "markers", "showlegend": False, **where}
+    figure.add_scatter(
+        x=list(scores.values()),
+        y=[label] * len(scores),
+        text=list(scores),
+        hovertemplate=f"%{{text}}: %{{x}}<extra>{name}</extra>",
+        marker={"color": colour, "opacity": 0.45, "size": 9},
+        **of_both,
+    )
+    figure.add_scatter(
+        x=[value],
+        y=[label],
+        hovertemplate=hover,
+        error_x={"type": "data", "symmetric": False, "array": [high - value], "arrayminus": [value - low]},
+        marker={"color": colour, "size": 12, "symbol": "diamond"},
+        **of_both,
+    )
+
+
 def final_chart(
     groups: Sequence[Group], reached: Sequence[MetricEstimates | None], baselines: Mapping[str, MetricEstimates]
 ) -> Figure:
@@ -125,28 +168,13 @@ def final_chart(
     rows += [(_wrapped(name), GREY, figures, {}) for name, figures in baselines.items()]
     figure = make_subplots(rows=1, cols=len(titles), shared_yaxes=True, horizontal_spacing=0.04)
     for column, (name, title) in enumerate(titles.items(), start=1):
-        here = {"mode": "markers", "showlegend": False, "row": 1, "col": column}
         for label, colour, figures, metrics in rows:
             if figures is None or name not in figures.estimates:
                 continue
-            value, low, high = figures.estimate(name)
+            estimate = figures.estimate(name)
             seeds = {seed: of_seed[name] for seed, of_seed in metrics.items() if name in of_seed}
-            figure.add_scatter(
-                x=list(seeds.values()),
-                y=[label] * len(seeds),
-                text=list(seeds),
-                hovertemplate="%{text}: %{x}<extra></extra>",
-                marker={"color": colour, "opacity": 0.45, "size": 8},
-                **here,
-            )
-            figure.add_scatter(
-                x=[value],
-                y=[label],
-                hovertemplate=f"%{{x}} ({low:.3g} to {high:.3g})<extra></extra>",
-                error_x={"type": "data", "symmetric": False, "array": [high - value], "arrayminus": [value - low]},
-                marker={"color": colour, "size": 11, "symbol": "diamond"},
-                **here,
-            )
+            hover = f"%{{x}} ({estimate.low:.3g} to {estimate.high:.3g})<extra></extra>"
+            add_estimate(figure, label, colour, estimate, seeds, hover, row=1, col=column)
         figure.update_xaxes(title=title, row=1, col=column, **(RATE_AXIS if is_rate(name) else {}))
     figure.update_yaxes(autorange="reversed", automargin=True)
     height = AROUND_PX + GROUP_PX * len(rows)

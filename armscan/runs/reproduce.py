@@ -19,10 +19,10 @@ from armscan.experiment.job import Invocation, remove_if_untracked
 from armscan.experiment.provenance import CHOICES_IN_TAGS, start_tracking
 from armscan.experiment.runner import run_tracked
 from armscan.runs.compare import Comparison, compare_runs
-from armscan.tracking import FoundRun, environment_tags, load_run, source
+from armscan.tracking import FoundRun, environment_tags, load_agent_run, source
 from armscan.tracking.environment import COMMIT, CONSTRAINTS_SUM, DIFF_SUM, DIRTY, REPORTED_PACKAGES, environment
 from armscan.tracking.sync import ENDED
-from armscan.tracking.tags import CHOICE, EVALUATED_TAG
+from armscan.tracking.tags import CHOICE
 from armscan.training import check_unchanged
 from armscan.utils.run_files import DIFF_FILE, ENVIRONMENT_FILE, REPRODUCTION_FILE, folder_lock
 
@@ -56,9 +56,7 @@ def load_original(tracking: str, run_id: str, *, trust: bool = False) -> Origina
         ArmscanError: If there is no such run, it was not made by `armscan run`, it has not ended, its files are missing
             or changed, or its volumes have changed since it was started.
     """
-    run = load_run(tracking, run_id)
-    if EVALUATED_TAG in run.tags:
-        raise InvalidValueError(f"run is {run_id!r}, but that is an evaluation, of {run.tags[EVALUATED_TAG]}")
+    run = load_agent_run(tracking, run_id)
     if run.status not in ENDED:
         raise InvalidValueError(f"run {run.run_id} has not ended ({run.status}): there is nothing to compare with yet")
     with tempfile.TemporaryDirectory() as folder:

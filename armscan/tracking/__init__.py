@@ -7,6 +7,7 @@ from armscan.tracking.lookup import (
     check_run_id,
     check_version,
     find_run,
+    load_agent_run,
     load_run,
     run_of_study,
 )
@@ -32,6 +33,7 @@ __all__ = [
     "environment_tags",
     "find_run",
     "flatten",
+    "load_agent_run",
     "load_run",
     "note_end",
     "open_existing_store",

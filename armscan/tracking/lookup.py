@@ -13,7 +13,7 @@ from packaging.version import InvalidVersion, Version
 
 import armscan
 from armscan.config.trust import needs_trust, stored_config
-from armscan.errors import TrackingError, TrackingUnavailableError, listed
+from armscan.errors import InvalidValueError, TrackingError, TrackingUnavailableError, listed
 from armscan.tracking.client import TrackingStore, all_pages
 from armscan.tracking.store import open_existing_store, store_errors
 from armscan.tracking.tags import EVALUATED_TAG, VERSION_TAG
@@ -189,6 +189,18 @@ def run_of_study(
         )
     if others := [name for name, value in tags.items() if run.data.tags.get(name) != value]:
         raise TrackingError(f"{where} names run {run_id}, which is another's, as its {others[0]} says: left as it is")
+    return run
+
+
+def load_agent_run(uri: str, run_id: str) -> FoundRun:
+    """Return a run as `load_run` does, which must not be an evaluation.
+
+    Raises:
+        InvalidValueError: If it is one.
+    """
+    run = load_run(uri, run_id)
+    if EVALUATED_TAG in run.tags:
+        raise InvalidValueError(f"run is {run_id!r}, but that is an evaluation, of {run.tags[EVALUATED_TAG]}")
     return run
 
 

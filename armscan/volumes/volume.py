@@ -142,6 +142,11 @@ class LabelVolume:
         c_x, c_y, c_z = ((n - 1) * s / 2 for n, s in zip(self.shape, self.spacing, strict=True))
         return c_x, c_y, c_z
 
+    @property
+    def slice_centre_mm(self) -> tuple[float, float]:
+        """Centre of a slice in the plane's frame, (across, depth) in mm."""
+        return self.centre_mm[0], self.centre_mm[2]
+
     @cached_property
     def slice_shape(self) -> tuple[int, int]:
         """Default shape of a slice: (nx, nz)."""

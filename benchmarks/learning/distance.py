@@ -48,7 +48,7 @@ def distances_of_accepted(
         of_volume = {name: reward_for(volume) for name, (reward_for, _) in rewards.items()}
         for plane in near_planes(volume, rng):
             landmarks = TissueClusters.from_slice(volume.slice(plane), pixel_mm=volume.pixel_mm).landmarks
-            distance = plane_distance(plane, volume.optimal_action, (volume.centre_mm[0], volume.centre_mm[2]))
+            distance = plane_distance(plane, volume.optimal_action, volume.slice_centre_mm)
             for name, (_, success_threshold) in rewards.items():
                 is_accepted = of_volume[name].score(landmarks, volume.pixel_mm) > -success_threshold
                 distances[name].append(distance if is_accepted else None)

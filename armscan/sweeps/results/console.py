@@ -12,7 +12,7 @@ from rich.text import Text
 
 from armscan.config.command_hints import armscan_command
 from armscan.errors import printable
-from armscan.experiment.console import print_table, print_where_to_look
+from armscan.experiment.console import print_result_table, print_where_to_look
 from armscan.sweeps.results.judgement import HOW, judge
 from armscan.sweeps.results.progress import status_line
 from armscan.sweeps.results.selection import candidates_of, objective_of
@@ -114,7 +114,7 @@ def _print_final_results(opened: OpenedStudy, final: FinalEvaluation) -> int:
     if judgement.differences:
         _print_rows(judgement.compared, [each.row() for each in judgement.differences])
         print_sentence(HOW)
-    print_table("the test volumes", final_table(judgement.results), judgement.notes)
+    print_result_table("the test volumes", final_table(judgement.results), judgement.notes)
     for name, settings in judgement.settings.items():
         print_sentence(f"{name}: {settings or NOTHING_SEARCHED}")
     print_sentence(f"result: {judgement.result}")

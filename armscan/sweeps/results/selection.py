@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from plotly.graph_objects import Figure
 
 from armscan.reports.chart_style import BLUE, GREY, ORANGE, RATE_AXIS
+from armscan.reports.charts import add_estimate
 from armscan.reports.html import chart, table
 from armscan.stats.bootstrap import Estimate
 from armscan.sweeps.results.judgement import Judgement
@@ -103,26 +104,11 @@ def selection_chart(candidates: Sequence[Candidate], objective: str) -> Figure:
     labels = [f"{each.name}, {each.outcome}" for each in candidates]
     for each, label in zip(candidates, labels, strict=True):
         colour = ORANGE if each.outcome == "chosen" else BLUE if each.number == CONTROL else GREY
-        value, low, high = each.estimate
-        said = html.escape(each.settings or NOTHING_SEARCHED)
-        figure.add_scatter(
-            x=list(each.scores.values()),
-            y=[label] * len(each.scores),
-            text=[f"seed {seed}" for seed in each.scores],
-            hovertemplate=f"%{{text}}: %{{x}}<extra>{each.name}</extra>",
-            mode="markers",
-            marker={"color": colour, "opacity": 0.45, "size": 9},
-            showlegend=False,
-        )
-        figure.add_scatter(
-            x=[value],
-            y=[label],
-            error_x={"type": "data", "symmetric": False, "array": [high - value], "arrayminus": [value - low]},
-            hovertemplate=f"%{{x:.4g}} ({low:.4g} to {high:.4g})<br>{said}<extra>{each.name}</extra>",
-            mode="markers",
-            marker={"color": colour, "symbol": "diamond", "size": 12},
-            showlegend=False,
-        )
+        settings = html.escape(each.settings or NOTHING_SEARCHED)
+        interval = f"{each.estimate.low:.4g} to {each.estimate.high:.4g}"
+        hover = f"%{{x:.4g}} ({interval})<br>{settings}<extra>{each.name}</extra>"
+        scores = {f"seed {seed}": score for seed, score in each.scores.items()}
+        add_estimate(figure, label, colour, each.estimate, scores, hover, each.name)
     axis: dict[str, Any] = {"title": f"{title_of(objective)}, validation volumes"}
     figure.update_xaxes(**axis, **(RATE_AXIS if is_rate(objective) else {}))
     figure.update_yaxes(autorange="reversed", automargin=True, categoryorder="array", categoryarray=labels)
