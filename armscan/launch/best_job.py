@@ -20,10 +20,16 @@ BEST_TAG = "best.run"
 
 
 def best_of(runs: Sequence[Run]) -> Run | None:
-    """Return the run with the highest leading on-plane rate on its test volumes; None if no run was evaluated."""
+    """Return the run with the highest leading on-plane rate on its test volumes.
+
+    None if no run was evaluated, or their leading rates are within different limits.
+    """
     rates = {f"{TESTED}{leading_of(run.data.params).metric}" for run in runs}
-    evaluated = [(run.data.metrics[rate], run) for rate in rates for run in runs if rate in run.data.metrics]
-    return max(evaluated, key=lambda each: float(each[0]), default=(None, None))[1]
+    if len(rates) != 1:
+        return None
+    (rate,) = rates
+    evaluated = [run for run in runs if rate in run.data.metrics]
+    return max(evaluated, key=lambda run: float(run.data.metrics[rate]), default=None)
 
 
 def show_best(store: TrackingStore, parent_id: str, jobs: Sequence[Run]) -> None:

@@ -17,4 +17,5 @@ def test_best_job_is_the_one_by_the_leading_limits():
     ]
     assert best_of(jobs) is jobs[0]
     assert best_of([job([[5, 10]])]) is None
+    assert best_of([*jobs, job([[5, 10]], **{"5mm_10deg": 1.0})]) is None
     assert best_of([]) is None

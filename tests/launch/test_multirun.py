@@ -1,6 +1,7 @@
 """Multiruns: the overrides that their jobs share, the address of their store, and their end."""
 
 import json
+from dataclasses import asdict
 from unittest.mock import Mock
 
 import pytest
@@ -9,8 +10,12 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Quote, QuotedString
 
 from armscan import run
-from armscan.experiment.job import PARENT_FILE
-from armscan.launch.multirun import Multirun, _common
+from armscan.experiment.job import INTERRUPTED, OUTCOME_FOLDER, PARENT_FILE, JobOutcome
+from armscan.launch.multirun import Multirun, _common, end_multirun
+from armscan.tracking import begin_outbox, sync
+from armscan.tracking.tags import FOLDER_TAG, JOB_TAG, PARENT_TAG
+from armscan.utils.processes import ProcessInfo
+from tests.support.stores import store_in
 
 
 @pytest.mark.parametrize("uri", ["sqlite:///mlruns.db", "sqlite:////tmp/it's.db", r"sqlite:////tmp/a\\'b.db"])
@@ -28,6 +33,37 @@ def test_second_interrupt_leaves_the_command_that_resumes_the_grid(tmp_path, mon
     told = capsys.readouterr().err
     assert told.startswith("the grid was not closed; resume it with: ")
     assert f"resume={'a' * 32} tracking.uri=sqlite:///mine.db" in told
+
+
+def test_job_that_was_stopped_alone_has_not_failed(tmp_path, database, monkeypatch, capsys):
+    store, experiment_id = store_in(tmp_path, "a")
+    parent = store.create_run(experiment_id, name="multirun", tags={}).info.run_id
+    tracking = {"uri": store.uri, "experiment": "a", "artifacts": str(tmp_path / "artifacts"), "wait_s": 60.0}
+    of_grid = {"run_id": parent, "tracking": tracking, "overrides": ["seed=0,1"], "common": [], "repeats": None}
+    (tmp_path / PARENT_FILE).write_text(json.dumps(of_grid | {"is_trusted": True, "trust": False}))
+    (tmp_path / OUTCOME_FOLDER).mkdir()
+    jobs = []
+    for number, failure in enumerate((INTERRUPTED, None)):
+        outcome = JobOutcome(f"seed={number}", f"seed={number}", failure)
+        (tmp_path / OUTCOME_FOLDER / f"{number}.json").write_text(json.dumps(asdict(outcome)))
+        tags = {JOB_TAG: str(number), FOLDER_TAG: str(tmp_path / str(number)), PARENT_TAG: parent}
+        jobs.append(store.create_run(experiment_id, name="job", tags=tags).info.run_id)
+    store.set_terminated(jobs[1], "FINISHED")
+    monkeypatch.setattr(Multirun, "folder", tmp_path)
+    assert end_multirun() == 1
+    assert [store.get_run(run_id).info.status for run_id in (*jobs, parent)] == ["KILLED", "FINISHED", "KILLED"]
+    assert "failed" not in capsys.readouterr().err
+
+
+def test_run_of_a_grid_whose_launcher_has_died_is_closed(tmp_path, database, monkeypatch):
+    store, experiment_id = store_in(tmp_path, "a")
+    parent = store.create_run(experiment_id, name="multirun", tags={}).info.run_id
+    begin_outbox(tmp_path, parent, store.uri).close()
+    sync(tmp_path, lambda _: store)
+    assert store.get_run(parent).info.status == "RUNNING"
+    monkeypatch.setattr(ProcessInfo, "is_alive", False)
+    sync(tmp_path, lambda _: store)
+    assert store.get_run(parent).info.status == "FAILED"
 
 
 def test_override_of_all_jobs_is_recognised_however_hydra_spells_it():
