@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from armscan.anatomy import FoundPlane
     from armscan.annotation.labelling import LabellingOptions
     from armscan.volumes import Dataset, LabelVolume
-    from armscan.volumes.summary import VolumeReport
+    from armscan.volumes.volume_report import VolumeReport
 
 # Folder of pictures within the folder of the data.
 PICTURES = "labelling"

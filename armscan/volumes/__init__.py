@@ -9,8 +9,8 @@ from armscan.volumes.phantom import load_phantom, load_phantoms, make_phantom
 from armscan.volumes.plane import ManipulatorAction, plane_distance, shift_into
 from armscan.volumes.reading import read_volume
 from armscan.volumes.rigid_transform import RigidTransform
-from armscan.volumes.summary import VolumeReport
 from armscan.volumes.volume import LabelVolume
+from armscan.volumes.volume_report import VolumeReport
 
 __all__ = [
     "LABEL_NAMES",

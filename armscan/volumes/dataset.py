@@ -13,8 +13,8 @@ from armscan.volumes.manifest import MANIFEST_NAMES, find_manifest, read_manifes
 from armscan.volumes.read_cache import read_kept, resample_kept
 from armscan.volumes.reading import ReadingOptions
 from armscan.volumes.resampling import finest_spacing
-from armscan.volumes.summary import VolumeReport
 from armscan.volumes.volume import LabelVolume
+from armscan.volumes.volume_report import VolumeReport
 
 if TYPE_CHECKING:
     from armscan.volumes.manifest_schema import Manifest, Splits

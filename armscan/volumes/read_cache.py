@@ -21,21 +21,20 @@ from armscan.volumes import (
     resampling,
     segmentation,
     stored_voxels,
-    summary,
     volume,
+    volume_report,
 )
 from armscan.volumes.header_checks import TEXT_HEADER_BYTES
 from armscan.volumes.mapped import SUFFIX, Made, kept_if_possible
 from armscan.volumes.plane import ManipulatorAction
 from armscan.volumes.resampling import Spacing, resample
-from armscan.volumes.summary import StoredFile
 from armscan.volumes.volume import LabelVolume
+from armscan.volumes.volume_report import StoredFile
 
 # Modules that volumes depend on: a change in one invalidates the cache.
 CODE = (
-    *(header_checks, labelmap, nifti_header, orientation, reading, resampling, segmentation, stored_voxels, summary),
-    plane,
-    volume,
+    *(header_checks, labelmap, nifti_header, orientation, reading, resampling, segmentation, stored_voxels),
+    *(plane, volume, volume_report),
 )
 READERS = ("SimpleITK", "slicerio", "pynrrd")
 # A text header that matches has its voxels in another file, or may have.

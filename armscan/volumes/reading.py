@@ -18,8 +18,8 @@ from armscan.volumes.labelmap import FoundSource, LabelMap, check_landmarks, map
 from armscan.volumes.orientation import AXES, Crop, check_axes, check_crop, check_orientation, orientation_of
 from armscan.volumes.plane import ManipulatorAction
 from armscan.volumes.segmentation import OVERLAPS, SEGMENTATION_SUFFIX, read_segmentation
-from armscan.volumes.summary import StoredFile, missing_sources
 from armscan.volumes.volume import LabelVolume
+from armscan.volumes.volume_report import StoredFile, missing_sources
 
 if TYPE_CHECKING:
     import SimpleITK

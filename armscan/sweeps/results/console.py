@@ -13,10 +13,10 @@ from rich.text import Text
 from armscan.config.command_hints import armscan_command
 from armscan.errors import printable
 from armscan.experiment.console import print_result_table, print_where_to_look
+from armscan.sweeps.results.final_results import final_table
 from armscan.sweeps.results.judgement import HOW, judge
 from armscan.sweeps.results.progress import status_line
 from armscan.sweeps.results.selection import candidates_of, objective_of
-from armscan.sweeps.results.summary import final_table
 from armscan.sweeps.scheduling.population import searched_values
 from armscan.sweeps.space.parameter import rounded_overrides
 from armscan.sweeps.storage.attribute_names import FAILURE

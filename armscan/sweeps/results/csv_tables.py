@@ -11,9 +11,9 @@ from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
 from optuna.trial import FrozenTrial, TrialState
 
 from armscan.reports.html import Row
+from armscan.sweeps.results.final_results import ConfigResult
 from armscan.sweeps.results.judgement import Judgement
 from armscan.sweeps.results.selection import Candidate, score_rows
-from armscan.sweeps.results.summary import ConfigResult
 from armscan.sweeps.scheduling.population import searched_values
 from armscan.sweeps.scheduling.state import TEST_PREFIX, is_feasible, loss_signs, seconds_of
 from armscan.sweeps.space.parameter import overrides_of

@@ -15,7 +15,7 @@ from armscan.experiment.results import volume_notes
 from armscan.stats.aggregation import probability_of_improvement
 from armscan.stats.bootstrap import Estimate
 from armscan.stats.paired import paired_difference
-from armscan.sweeps.results.summary import ConfigResult, final_results, final_table, scores_of, subjects_of
+from armscan.sweeps.results.final_results import ConfigResult, final_results, final_table, scores_of, subjects_of
 from armscan.sweeps.scheduling.state import CONTROL, TEST_PREFIX, metrics_of_test
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.attribute_names import METRICS, OBJECTIVES

@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from armscan.errors import ArmscanError, printable
-from armscan.sweeps.results.summary import values_of
+from armscan.sweeps.results.final_results import values_of
 from armscan.sweeps.scheduling.population import searched_values
 from armscan.sweeps.scheduling.state import StudyState, is_feasible, seconds_of
 from armscan.sweeps.space.parameter import overrides_of

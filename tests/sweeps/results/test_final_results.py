@@ -9,7 +9,7 @@ from optuna.trial import TrialState, create_trial
 from scipy.stats import ttest_1samp
 
 from armscan.errors import StudyError
-from armscan.sweeps.results.summary import final_results, final_table, scores_of
+from armscan.sweeps.results.final_results import final_results, final_table, scores_of
 from armscan.sweeps.storage.attribute_names import EPISODES, FINAL_SEED, FINALIST, METRICS
 from armscan.training import Evaluation
 from tests.training.test_result_table import made_episodes, recomputed
