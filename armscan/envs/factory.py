@@ -57,11 +57,9 @@ class EnvFactory:
         """Make one environment."""
         return make_armscan_env(volumes, render_mode=render_mode, **self.rules)
 
-    def make_vector_env(
-        self, num_envs: int, volumes: Volumes, *, autoreset_mode: str = "NextStep"
-    ) -> VectorEnv[Any, Any, Any]:
-        """Make a vector environment on these volumes."""
-        return make_armscan_vector_env(num_envs, volumes, autoreset_mode=autoreset_mode, **self.rules)
+    def make_vector_env(self, num_envs: int, volumes: Volumes) -> VectorEnv[Any, Any, Any]:
+        """Make a vector environment without autoreset on these volumes, as Tianshou's collectors need it."""
+        return make_armscan_vector_env(num_envs, volumes, autoreset_mode="Disabled", **self.rules)
 
 
 def make_armscan_env(

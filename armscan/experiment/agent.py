@@ -69,7 +69,7 @@ def make_agent(
 
 def _vector_envs(env_factory: EnvFactory, volumes: Mapping[str, LabelVolume]) -> VectorEnvFactory:
     """Return a factory of vector environments on these volumes, without autoreset."""
-    return partial(env_factory.make_vector_env, volumes=dict(volumes), autoreset_mode="Disabled")
+    return partial(env_factory.make_vector_env, volumes=dict(volumes))
 
 
 def _check_learner(agent: Agent) -> None:

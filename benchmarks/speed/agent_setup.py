@@ -19,7 +19,7 @@ def agent_setup(
     """Return the setup of an agent with seed 0; without `compute`, on the CPU."""
     env = env_factory.make_env(volumes)
     return AgentSetup(
-        make_envs=partial(env_factory.make_vector_env, volumes=volumes, autoreset_mode="Disabled"),
+        make_envs=partial(env_factory.make_vector_env, volumes=volumes),
         observation_space=env.observation_space,
         action_names=env.get_wrapper_attr("action_names"),
         total_env_steps=total_env_steps,

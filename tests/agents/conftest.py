@@ -23,7 +23,7 @@ ENV_FACTORIES = {
 
 def setup_for(env_factory, phantom, **changes):
     arguments = {
-        "make_envs": partial(env_factory.make_vector_env, volumes=[phantom], autoreset_mode="Disabled"),
+        "make_envs": partial(env_factory.make_vector_env, volumes=[phantom]),
         "observation_space": env_factory.make_env([phantom]).observation_space,
         "action_names": ("rz", "ty"),
         "total_env_steps": 100,

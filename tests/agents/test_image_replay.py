@@ -31,7 +31,7 @@ RULES = {
 @pytest.fixture(params=list(RULES))
 def envs(request, phantom):
     rules = RULES[request.param] | {"max_steps": 4, "projection": "zy"}
-    return EnvFactory(**rules).make_vector_env(N_ENVS, [phantom], autoreset_mode="Disabled")
+    return EnvFactory(**rules).make_vector_env(N_ENVS, [phantom])
 
 
 def played(envs, n_steps, seed=0):
@@ -116,7 +116,7 @@ def test_replay_takes_some_of_the_environments(envs):
 def test_no_frame_is_kept_twice_within_an_episode(phantom):
     envs = EnvFactory(
         observation="slice", projection="zy", stack=4, success_threshold=1e-9, max_steps=50
-    ).make_vector_env(1, [phantom], autoreset_mode="Disabled")
+    ).make_vector_env(1, [phantom])
     replay = replay_for(envs.single_observation_space, 100, 1)
     for batch in played(envs, 30):
         replay.add(batch)

@@ -37,7 +37,7 @@ RULES = {
 def made(phantom, rules=None, **changes):
     env_factory = EnvFactory(**RULES | (rules or {}))
     names = (*NAMES, "stop") if (rules or {}).get("ends") == "on_stop" else NAMES
-    validation = partial(env_factory.undeformed().make_vector_env, volumes=[phantom], autoreset_mode="Disabled")
+    validation = partial(env_factory.undeformed().make_vector_env, volumes=[phantom])
     setup = setup_for(env_factory, phantom, action_names=names, total_env_steps=480, make_validation_envs=validation)
     return PlaneFinder(**SMALL | changes).agent(setup), env_factory.make_env([phantom])
 
@@ -206,7 +206,7 @@ def test_calibration_changes_nothing_that_is_learned(phantom):
 @pytest.mark.parametrize("share", [None, 0.0, 0.25, 1.0])
 def test_phantoms_have_their_share_beside_other_volumes(phantom, share):
     wrist = LabelVolume(phantom.labels, phantom.spacing, "wrist", phantom.optimal_action)
-    envs = partial(EnvFactory(**RULES).make_vector_env, volumes=[phantom, wrist], autoreset_mode="Disabled")
+    envs = partial(EnvFactory(**RULES).make_vector_env, volumes=[phantom, wrist])
     setup = setup_for(EnvFactory(**RULES), phantom, action_names=NAMES, total_env_steps=480, make_envs=envs)
     learner = PlaneFinder(**SMALL | {"num_envs": 40}, phantom_share=share).agent(setup)
     drawn = learner._volumes(np.random.default_rng(0), 40)

@@ -85,7 +85,7 @@ def test_regression_learns_where_the_plane_lies_on_two_phantoms():
     setup = setup_for(
         env_factory,
         volumes[0],
-        make_envs=partial(env_factory.make_vector_env, volumes=volumes, autoreset_mode="Disabled"),
+        make_envs=partial(env_factory.make_vector_env, volumes=volumes),
         observation_space=env.observation_space,
         total_env_steps=3000,
     )

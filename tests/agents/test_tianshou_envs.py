@@ -14,7 +14,7 @@ from tests.agents.conftest import setup_for
 def make(phantom):
     def make(**rules):
         env_factory = EnvFactory(projection="zy", max_steps=4, **rules)
-        envs = TianshouVectorEnv(env_factory.make_vector_env(3, [phantom], autoreset_mode="Disabled"))
+        envs = TianshouVectorEnv(env_factory.make_vector_env(3, [phantom]))
         envs.seed([7, 8, 9])
         return envs
 

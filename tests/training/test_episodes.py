@@ -54,7 +54,7 @@ CASES = {
 def made(algorithm, env_factory, volumes, compute=None):
     """Make an agent, and let it learn a little if it does."""
     setup = AgentSetup(
-        make_envs=partial(env_factory.make_vector_env, volumes=volumes, autoreset_mode="Disabled"),
+        make_envs=partial(env_factory.make_vector_env, volumes=volumes),
         observation_space=env_factory.make_env(volumes).observation_space,
         action_names=("rz", "ty"),
         total_env_steps=100,
