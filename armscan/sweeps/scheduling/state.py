@@ -127,10 +127,10 @@ def loss_signs(directions: Sequence[StudyDirection]) -> FloatArray:
 
 def retried_by(trial: FrozenTrial | Trial, trials: Sequence[FrozenTrial]) -> Iterator[int]:
     """Yield the numbers of the attempts that a trial replaces, the latest first."""
-    number = trial.user_attrs.get(RETRY_OF)
-    while number is not None:
+    # A stranger may have written any number.
+    while (number := trial.user_attrs.get(RETRY_OF)) is not None and number < trial.number:
         yield number
-        number = trials[number].user_attrs.get(RETRY_OF)
+        trial = trials[number]
 
 
 def env_steps_of(trial: FrozenTrial) -> int:
