@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -24,8 +25,8 @@ from armscan.envs.vector_env import reset_each
 from armscan.errors import InvalidValueError
 from armscan.utils.arrays import FloatArray
 
-# Prefix of the names of phantoms.
-PHANTOM = "phantom-"
+# Names of phantoms; those of files have an extension.
+PHANTOM = re.compile(r"phantom-[\w-]+")
 # Perturbed looks: range of the standard deviations, in mm and degrees, which are drawn log-uniformly.
 ASTRAY_MM, ASTRAY_DEG = (0.5, 6.0), (1.0, 8.0)
 # Factors on the loss thresholds for the first look: normal, normal, along it, across.
@@ -95,7 +96,9 @@ class PlaneFinderLearner(SupervisedLearner):
     def _volumes(self, rng: np.random.Generator, n_episodes: int) -> dict[str, Any] | None:
         """Draw the volume of each episode by `phantom_share`; None leaves the choice to the environments."""
         phantom_share, names = self._finder.phantom_share, self._labelled_envs.rules.names
-        groups = [[name for name in names if name.startswith(PHANTOM) == of_phantoms] for of_phantoms in (True, False)]
+        groups = [
+            [name for name in names if bool(PHANTOM.fullmatch(name)) == of_phantoms] for of_phantoms in (True, False)
+        ]
         if phantom_share is None or not all(groups):
             return None
         chosen = (rng.random(n_episodes) >= phantom_share).astype(int)

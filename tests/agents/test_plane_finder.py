@@ -205,7 +205,7 @@ def test_calibration_changes_nothing_that_is_learned(phantom):
 
 @pytest.mark.parametrize("share", [None, 0.0, 0.25, 1.0])
 def test_phantoms_have_their_share_beside_other_volumes(phantom, share):
-    wrist = LabelVolume(phantom.labels, phantom.spacing, "wrist", phantom.optimal_action)
+    wrist = LabelVolume(phantom.labels, phantom.spacing, "phantom-wrist.nrrd", phantom.optimal_action)
     envs = partial(EnvFactory(**RULES).make_vector_env, volumes=[phantom, wrist])
     setup = setup_for(EnvFactory(**RULES), phantom, action_names=NAMES, total_env_steps=480, make_envs=envs)
     learner = PlaneFinder(**SMALL | {"num_envs": 40}, phantom_share=share).agent(setup)
@@ -214,7 +214,7 @@ def test_phantoms_have_their_share_beside_other_volumes(phantom, share):
         assert drawn is None
     else:
         assert drawn["volume"].count("phantom-0") == pytest.approx(40 * share, abs=7)
-        assert set(drawn["volume"]) <= {"phantom-0", "wrist"}
+        assert set(drawn["volume"]) <= {"phantom-0", "phantom-wrist.nrrd"}
     learner.learn(120)
     assert learner.n_env_steps == 120
 
