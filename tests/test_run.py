@@ -389,11 +389,14 @@ def test_interrupted_run_is_closed_as_killed(tmp_path, multirun):
 
 @pytest.mark.full
 @pytest.mark.parametrize(
-    ("ending", "line"),
-    [(signal.SIGKILL, "killed by SIGKILL: out of memory?"), (signal.SIGTERM, "failed: interrupted")],
-    ids=lambda value: getattr(value, "name", ""),
+    ("ending", "line", "of_grid"),
+    [
+        (signal.SIGKILL, "killed by SIGKILL: out of memory?", ["FAILED", "FAILED", "FINISHED"]),
+        (signal.SIGTERM, "interrupted", ["FINISHED", "KILLED", "KILLED"]),
+    ],
+    ids=["killed", "interrupted"],
 )
-def test_job_that_is_ended_takes_no_other_with_it(tmp_path, ending, line):
+def test_job_that_is_ended_takes_no_other_with_it(tmp_path, ending, line, of_grid):
     words = ["-m", "seed=0,1", "hydra.launcher.n_jobs=2", *SMALL, "training.env_steps=8000"]
     process = start_run(*words, cwd=tmp_path)
 
@@ -406,10 +409,10 @@ def test_job_that_is_ended_takes_no_other_with_it(tmp_path, ending, line):
     assert process.wait(HANG_S) == 1
     output = (tmp_path / "printed").read_text()
     assert output.count(line) == 1
-    assert "again alone: python -m armscan.run seed=" in output
+    assert ("again alone: python -m armscan.run seed=" in output) is (ending == signal.SIGKILL)
+    assert "resume all with: " in output
     assert "Traceback" not in output
-    statuses = sorted(each.info.status for each in runs_in(tmp_path)[1])
-    assert statuses == ["FAILED", "FAILED", "FINISHED"]
+    assert sorted(each.info.status for each in runs_in(tmp_path)[1]) == of_grid
 
 
 def job_process_ids(launcher_pid):

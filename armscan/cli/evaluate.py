@@ -18,7 +18,7 @@ from armscan.cli.options import (
     trust_option,
 )
 from armscan.errors import InvalidValueError
-from armscan.utils.validation import MAX_SEED, check_int
+from armscan.utils.validation import MAX_SEED
 
 if TYPE_CHECKING:
     from armscan.evaluation.runner import PreparedAgent
@@ -211,5 +211,6 @@ def _check_words(run: Sequence[str], agent: str | None, data: str | None, change
 
 def _check_episodes(n_episodes: int, groups: Mapping[str, Volumes]) -> None:
     for label, volumes in groups.items():
-        which = f"episodes, of which each of {len(volumes)} {label} is to have one,"
-        check_int(which, n_episodes, at_least=len(volumes))
+        if n_episodes < len(volumes):
+            least = f"at least {len(volumes)}: one for each of the {label}"
+            raise InvalidValueError(f"--episodes is {n_episodes}, but it must be {least}")

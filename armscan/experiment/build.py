@@ -35,7 +35,6 @@ from armscan.training import (
 from armscan.training.domain import smallest_slice, with_crops
 from armscan.training.episode_results import Env
 from armscan.utils.log import silence_libraries
-from armscan.utils.text import counted
 from armscan.utils.validation import check_int, check_seed
 from armscan.volumes import LabelVolume
 
@@ -137,9 +136,6 @@ def build_experiment(config: DictConfig, split: Split | None = None) -> Experime
         validation=split.validation,
         schedule=budget.segments,
     )
-    _check_episodes("evaluation.episodes", config.evaluation.episodes, "test", split)
-    if isinstance(agent, Learner):
-        _check_episodes("training.validation_episodes", budget.validation_episodes, "validation", split)
     return Experiment(
         split=split,
         env_factory=env_factory,
@@ -153,12 +149,24 @@ def build_experiment(config: DictConfig, split: Split | None = None) -> Experime
     )
 
 
-def _check_episodes(key: str, n_episodes: int, part: str, split: Split) -> None:
-    """Raise `InvalidValueError` if some of the volumes that a result is about would never be seen."""
+def check_episodes(experiment: Experiment) -> None:
+    """Check that a new run validates and tests on each of its volumes.
+
+    Raises:
+        InvalidValueError: If it has fewer episodes than volumes.
+    """
+    check_each_seen("evaluation.episodes", experiment.n_episodes, "test", experiment.split)
+    if isinstance(experiment.agent, Learner):
+        budget = experiment.budget
+        check_each_seen("training.validation_episodes", budget.validation_episodes, "validation", experiment.split)
+
+
+def check_each_seen(key: str, n_episodes: int, part: str, split: Split) -> None:
+    """Raise `InvalidValueError` if there are fewer episodes than volumes in a part of a split."""
     n_volumes = len(split.parts[part])
-    check_int(
-        f"{key}, of which each of the {counted(n_volumes, f'{part} volume')} gets one,", n_episodes, at_least=n_volumes
-    )
+    if n_episodes < n_volumes:
+        least = f"at least {n_volumes}: one for each {part} volume"
+        raise InvalidValueError(f"{key} is {n_episodes}, but it must be {least}")
 
 
 def check_config(config: DictConfig) -> None:

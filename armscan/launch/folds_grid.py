@@ -38,9 +38,11 @@ def with_folds(words: Sequence[str]) -> list[str]:
     # Hydra or the run reports it.
     except (HydraException, OmegaConfBaseException):
         return list(words)
+    if fold is not None or any(each.key_or_group == FOLD for each in parsed):
+        return list(words)
     if any(each.key_or_group == FOLDS and each.is_sweep_override() for each in parsed):
-        raise InvalidValueError(f"{FOLDS} has several values, but a grid has one number of folds: start one for each")
-    if folds is None or fold is not None or any(each.key_or_group == FOLD for each in parsed):
+        raise InvalidValueError(f"{FOLDS} has several values, but all jobs of a grid share one: start a grid for each")
+    if folds is None:
         return list(words)
     # Deferred: command-line errors are reported before these are loaded.
     from armscan.training.subject_splits import n_folds

@@ -55,7 +55,7 @@ def _on_seeds(groups: Sequence[Group]) -> Iterator[str]:
     n_seeds = {group.number: len(evaluations_by_seed(group)) or group.n_seeds for group in groups}
     if single := [number for number, n in n_seeds.items() if n == 1]:
         yield (
-            f"{_numbered(single, groups)}: one seed says nothing about other seeds; intervals cover volumes and "
+            f"{_numbered(single, groups)}: one seed says nothing about other seeds; intervals cover wrists and "
             "episodes only."
         )
     if few := [number for number, n in n_seeds.items() if 1 < n < MANY_SEEDS]:

@@ -4,7 +4,7 @@ The difference for each seed and volume is modelled as a seed effect, a volume e
 with random effects, with Satterthwaite's degrees of freedom (1946, doi:10.2307/3002019), as diagnostic studies cross
 readers and cases (Hillis 2014, doi:10.1002/sim.5926). With two or three seeds their mean square is often small by
 chance; the degrees of freedom are then those of the volumes, which is too many. So the interval is made at least as
-wide as Student's for other seeds alone, and for other volumes alone. Unlike a percentile bootstrap, it is then wide
+wide as Student's for other seeds alone, and for other subjects alone. Unlike a percentile bootstrap, it is then wide
 enough for few seeds and volumes. Several volumes of one subject (arm) are alike, and count as one: see `of_subjects`.
 """
 
@@ -41,7 +41,7 @@ def paired_difference(ours: FloatArray, theirs: FloatArray, subjects: Sequence[s
 
 
 def mean_over_seeds(scores: FloatArray) -> Estimate:
-    """Return the mean score with its 95 % interval for other seeds and other volumes.
+    """Return the mean score with its 95 % interval for other seeds and other subjects.
 
     Args:
         scores: Scores, shape (seeds, volumes).
@@ -57,8 +57,9 @@ def mean_over_seeds(scores: FloatArray) -> Estimate:
 def of_subjects(values: FloatArray, subjects: Sequence[str]) -> FloatArray:
     """Return values of subjects instead of volumes, with the same mean.
 
-    A subject's value is its volumes' mean; its distance from the mean of all is multiplied by its number of volumes,
-    relative to other subjects': the linearised ratio estimator (Cochran 1977, Sampling Techniques, section 6.3).
+    A subject's value is the overall mean plus the deviation of its volumes' mean from it, weighted by its number of
+    volumes relative to the average subject's: the linearised ratio estimator (Cochran 1977, Sampling Techniques,
+    section 6.3).
 
     Args:
         values: Values, shape (..., seeds, volumes).
@@ -69,7 +70,7 @@ def of_subjects(values: FloatArray, subjects: Sequence[str]) -> FloatArray:
     """
     names, number_of = np.unique(subjects, return_inverse=True)
     n_subjects, n_volumes = len(names), len(subjects)
-    # Without the rounding below.
+    # Unchanged to the last bit: the product below would round.
     if n_subjects == n_volumes:
         return values
     centre = values.mean(axis=(-2, -1), keepdims=True)

@@ -185,7 +185,8 @@ def run_of_study(
         raise TrackingError(f"{where}: {error}") from error
     if run.info.experiment_id != experiment_id:
         raise TrackingError(
-            f"{where} names run {run_id}, which is another's, or tracking.experiment was another before: left as it is"
+            f"{where} names run {run_id}, which is another's, as its experiment says: left as it is (was "
+            "tracking.experiment another before?)"
         )
     if others := [name for name, value in tags.items() if run.data.tags.get(name) != value]:
         raise TrackingError(f"{where} names run {run_id}, which is another's, as its {others[0]} says: left as it is")

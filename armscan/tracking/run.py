@@ -14,7 +14,7 @@ from armscan.tracking.client import TrackingStore
 from armscan.tracking.environment import DIFF_SUM, environment_tags, source
 from armscan.tracking.notes import forget
 from armscan.tracking.outbox import Address, Outbox, file_of, now_ms
-from armscan.tracking.sanitize import metric_name_of, params_of, tags_of
+from armscan.tracking.sanitize import params_of, tags_of
 from armscan.tracking.system_metrics import PREFIX, SystemMetrics
 from armscan.tracking.tags import FAILURE_TAG, PARENT_TAG, PRUNED_TAG
 from armscan.tracking.uploader import Uploader
@@ -195,7 +195,7 @@ class TrackedRun:
         at_ms = now_ms()
         points = [
             (name, float(value), at_ms, n_env_steps)
-            for name, value in zip(map(metric_name_of, figures), figures.values(), strict=True)
+            for name, value in figures.items()
             # NaN is the mean over no episodes.
             if (keeps_nan or value == value) and (name, n_env_steps) not in self._logged
         ]

@@ -7,7 +7,7 @@ import itertools
 import json
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from armscan.config.trust import TRUST
@@ -15,7 +15,7 @@ from armscan.errors import TrackingError, UntrustedError
 from armscan.tracking.client import NOT_THERE, TrackingStore, reason_in, unavailable_reason
 from armscan.tracking.logged_model import upload_model
 from armscan.tracking.outbox import CHANNELS, Channel, Outbox, file_and_place
-from armscan.tracking.sanitize import MAX_PARAM_CHARS, MAX_TAG_CHARS, truncate
+from armscan.tracking.sanitize import MAX_PARAM_CHARS, MAX_TAG_CHARS, metric_name_of, truncate
 from armscan.tracking.tags import NOTE_TAG
 from armscan.utils.files import sha256
 from armscan.utils.log import log
@@ -185,7 +185,11 @@ def _upload(client: MlflowClient, outbox: Outbox, kind: str, values: list[Any]) 
         case "metrics" | "params" | "tags":
             name, at_once = AT_ONCE[kind]
             entity = getattr(entities, name)
-            rest = itertools.chain(*(each.items() if isinstance(each, dict) else each for each in values))
+            of_all = (each.items() if isinstance(each, dict) else each for each in values)
+            rest: Iterator[Any] = itertools.chain.from_iterable(of_all)
+            if kind == "metrics":
+                # Volumes, and with them their metrics, may have any name.
+                rest = ((metric_name_of(key), *point) for key, *point in rest)
             while batch := [entity(*each) for each in itertools.islice(rest, at_once)]:
                 request: dict[str, Any] = {kind: batch}
                 client.log_batch(run_id, **request)

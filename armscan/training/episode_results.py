@@ -218,7 +218,7 @@ class Evaluation:
     @property
     def subject_of(self) -> dict[str, str]:
         """Subject of each volume, by name; a volume without one is its own subject."""
-        return {episode.volume: episode.subject or episode.volume for episode in self.episodes}
+        return subject_of_volumes([self])
 
     def to_dict(self) -> dict[str, Any]:
         """Return the figures and every episode, ready for JSON."""
@@ -237,6 +237,14 @@ class Evaluation:
 
     def _mean(self, name: str) -> float:
         return statistics.fmean(map(attrgetter(MEANS[name]), self.episodes)) if self.episodes else float("nan")
+
+
+def subject_of_volumes(evaluations: Iterable[Evaluation]) -> dict[str, str]:
+    """Return the subject of each volume by name; a volume without one is its own subject."""
+    episodes = [episode for evaluation in evaluations for episode in evaluation.episodes]
+    own = {episode.volume: episode.volume for episode in episodes}
+    # Evaluations of earlier versions do not know subjects.
+    return own | {episode.volume: episode.subject for episode in episodes if episode.subject}
 
 
 def _episode_of(plain: object) -> EpisodeResult:

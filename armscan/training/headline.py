@@ -15,7 +15,7 @@ import numpy as np
 
 from armscan.stats.bootstrap import Estimate, difference_of_rates, wilson
 from armscan.stats.paired import crossed_mean, of_subjects
-from armscan.training.episode_results import Evaluation
+from armscan.training.episode_results import Evaluation, subject_of_volumes
 from armscan.training.metric_display import interval_text
 from armscan.training.metrics import MetricEstimates
 from armscan.utils.text import formatted
@@ -46,7 +46,7 @@ def beside_random(
         return figures
     scores = np.array([[each[name] for name in theirs] for each in ours])
     assert random is not None
-    subject_of = random.subject_of
+    subject_of = subject_of_volumes([random, *trainings])
     differences = of_subjects(scores - np.array([*theirs.values()]), [subject_of[name] for name in theirs])
     mean, half = crossed_mean(differences)
     above = Estimate.around(mean, half).clipped(-1.0, 1.0)

@@ -26,7 +26,7 @@ MAX_ABREAST = 6
 PADDING_CHARS = 2
 MISSING = "–"
 HOW = (
-    "95 % intervals resample seeds, volumes and episodes. If all episodes of a rate are equal, its interval is "
+    "95 % intervals resample seeds, subjects and episodes. If all episodes of a rate are equal, its interval is "
     "Wilson's, which takes episodes as independent. Means include failed episodes; the IQM is the mean of their middle "
     "half. On plane: share of episodes whose last plane is this close to the labelled one. Success: share of episodes "
     "whose last plane the reward accepts; it may lie far from the labelled one."

@@ -45,7 +45,8 @@ class Split:
         if not all(self.parts.values()):
             raise InvalidValueError(
                 f"of {len(self.training)} volumes for training, {len(self.validation)} for validation and "
-                f"{len(self.test)} for the test, each must be at least 1: the volumes must be of three subjects or more"
+                f"{len(self.test)} for the test, each must be at least 1: give more subjects, more folds, or "
+                "data.validation"
             )
         seen: dict[str, str] = {}
         for part, volumes in self.parts.items():

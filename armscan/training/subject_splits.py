@@ -93,11 +93,6 @@ def parts_by_subject(
             )
         test, after = tested(list(dict.fromkeys(dataset.subjects.values())), folds, fold, split_seed)
         of_next = {"validation": after} if "validation" in wanted and wanted["validation"] is None else {}
-        if of_next and not set(dataset.subjects.values()) - {*test, *after}:
-            raise InvalidValueError(
-                f"data.folds is {folds!r}, which leaves no subject to train on: one fold is tested on and the next "
-                "validates; give 3 or more, or data.validation"
-            )
         wanted = {**wanted, "test": test, **of_next}
     elif dataset.splits is not None and all(each is None for each in wanted.values()):
         return {name: dataset.splits[name] if dataset.splits[name] in wanted else "train" for name in dataset.volumes}

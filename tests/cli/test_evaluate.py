@@ -29,7 +29,10 @@ def test_evaluate_answers_mistakes_in_one_line(evaluate, tmp_path, data_folder):
             "there is no key 'n_test' in data, but only path, validation, test, split_seed, folds or fold",
         ),
         ([run_id, "--episodes=0"], "Invalid value for '--episodes': 0 is not in the range x>=1."),
-        ([run_id, f"--data={data_folder}", "--episodes=3"], "episodes, of which each of 4 volumes is to have one"),
+        (
+            [run_id, f"--data={data_folder}", "--episodes=3"],
+            "--episodes is 3, but it must be at least 4: ",
+        ),
         ([run_id, "--seed=-1"], "Invalid value for '--seed': -1 is not in the range 0<=x<=2147483647."),
         ([run_id, "--phantoms=3"], "--phantoms is 3, but it is for --data phantom"),
         ([run_id, "experiment=x"], f"'{run_id} experiment=x' configures an agent: give --agent NAME with it"),

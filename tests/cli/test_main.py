@@ -14,6 +14,7 @@ from armscan.cli.main import main
 from armscan.config.defaults import CHANGES
 from armscan.errors import VolumeError
 from tests.support.programs import imported_by
+from tests.support.stores import store_in
 
 
 def commands(group=program, path=()):
@@ -106,11 +107,14 @@ def test_mistakes_and_interrupts_are_one_line(monkeypatch, capsys):
     assert capsys.readouterr().err == "\ninterrupted\n"
 
 
-def test_reader_that_has_ended_is_no_mistake(tmp_path):
+def test_reader_that_has_ended_is_no_mistake(tmp_path, database):
+    store, experiment_id = store_in(tmp_path, "a")
+    store.create_run(experiment_id, name="n", tags={})
     list_runs = "import sys; from armscan.cli.main import main; sys.exit(main(['runs', 'list', '--format', 'csv']))"
     with subprocess.Popen([sys.executable, "-c", list_runs], cwd=tmp_path, stdout=PIPE, stderr=PIPE) as process:
         process.stdout.close()
-        assert b"Broken pipe" not in process.stderr.read()
+        assert process.stderr.read() == b""
+    assert process.returncode == 1
 
 
 def test_faults_of_the_program_are_not_hidden(monkeypatch):

@@ -30,6 +30,15 @@ def test_few_volumes_are_said_in_one_line(n_test, n_validation, few):
     assert [note.partition(", fewer than 8")[0] for note in notes] == ([few] if few else [])
 
 
+@pytest.mark.parametrize("is_first", [True, False])
+def test_subjects_are_those_of_the_evaluations_that_know_them(is_first):
+    older = made_episodes(0, n_volumes=8)
+    newer = tuple(replace(each, subject=str(int(each.volume[1:]) // 2)) for each in older)
+    evaluations = [Evaluation(newer), Evaluation(older)]
+    figures = MetricEstimates.of_trainings(dict(enumerate(evaluations if is_first else reversed(evaluations))))
+    assert (figures.n_volumes, figures.n_subjects) == (8, 4)
+
+
 def test_volumes_of_one_subject_are_one_wrist():
     of_pairs = tuple(replace(each, subject=str(int(each.volume[1:]) // 2)) for each in made_episodes(0, n_volumes=8))
     figures = MetricEstimates.of(Evaluation(of_pairs))

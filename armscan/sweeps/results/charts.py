@@ -94,8 +94,8 @@ def _hover(trials: Sequence[FrozenTrial]) -> dict[str, Any]:
 def _history(trials: Sequence[FrozenTrial], number: int, objective: str, direction: StudyDirection) -> Figure:
     """Return the values of the trials in order, and the best so far among feasible ones."""
     figure = Figure()
-    for name, color, is_kept in (("trial", BLUE, True), ("infeasible trial", GREY, False)):
-        drawn = [trial for trial in trials if is_feasible(trial) == is_kept]
+    for name, color, wants_feasible in (("trial", BLUE, True), ("infeasible trial", GREY, False)):
+        drawn = [trial for trial in trials if is_feasible(trial) == wants_feasible]
         hover = _hover(drawn)
         points: dict[str, Any] = {"mode": "markers", "marker": {"color": color, "size": 7, "opacity": 0.7}}
         numbers, values = [trial.number for trial in drawn], list(map(_value(number), drawn))

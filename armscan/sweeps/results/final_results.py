@@ -18,6 +18,7 @@ from armscan.sweeps.storage.attribute_names import EPISODES, FINAL_SEED, FINALIS
 from armscan.sweeps.study.final_eval import name_of
 from armscan.training import TEST, Evaluation, MetricEstimates, ResultTable
 from armscan.training.baselines import RANDOM
+from armscan.training.episode_results import subject_of_volumes
 from armscan.training.headline import beside_random
 from armscan.training.metrics import COUNTS
 from armscan.training.result_table import with_baselines
@@ -54,8 +55,8 @@ def final_table(results: Sequence[ConfigResult]) -> ResultTable:
 def final_results(trials: Sequence[FrozenTrial]) -> list[ConfigResult]:
     """Return the final evaluation of each configuration, over all episodes of all its trainings.
 
-    The intervals resample seeds, each with all its volumes, because one training was evaluated on all of them. Older
-    trials stored no episodes; their intervals come from the means of seeds and volumes.
+    The intervals resample seeds and subjects; all drawn seeds share the drawn subjects. Older trials stored no
+    episodes; their intervals come from the means of seeds and volumes.
 
     Args:
         trials: Trials of the final evaluation; unfinished ones are left out.
@@ -102,10 +103,9 @@ def _of_means(of_seeds: Sequence[Mapping[str, float]]) -> MetricEstimates:
     return MetricEstimates(len(of_seeds), n_volumes, n_volumes, episodes, solved, means, limits_among(means))
 
 
-def subjects_of(trial: FrozenTrial) -> dict[str, str]:
+def subjects_of(trials: Sequence[FrozenTrial]) -> dict[str, str]:
     """Return the subject of each test volume; empty for older trials, which stored no episodes."""
-    played = _episodes(trial)
-    return played[TEST].subject_of if played else {}
+    return subject_of_volumes(played[TEST] for trial in trials if (played := _episodes(trial)))
 
 
 def scores_of(name: str, of_seeds: Sequence[Mapping[str, float]]) -> tuple[list[str], NDArray[np.float64]]:

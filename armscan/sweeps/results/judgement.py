@@ -163,10 +163,10 @@ class Judgement:
         if not self.differences and self.n_unjudged:
             return f"{name} was chosen; it has not been judged beside the control yet."
         if not self.differences:
-            return (
-                f"{name} was chosen, but it cannot be compared with the control: {self.n_seeds} of {self.n_planned} "
-                "seeds were trained to their end with both."
-            )
+            reason = f"{self.n_seeds} of {self.n_planned} seeds were trained to their end with both"
+            if self.n_seeds:
+                reason = "their trainings have no test volume in common"
+            return f"{name} was chosen, but it cannot be compared with the control: {reason}."
         first = self.differences[0]
         if math.isnan(first.paired.low):
             return f"{name} was chosen; one seed does not show whether it is better than the control."
@@ -263,11 +263,12 @@ def _differences(
     metrics = [trial.user_attrs[METRICS] for trial in (*chosen, *control)]
     common = set.intersection(*map(set, metrics))
     tested = [name for name in metrics_of_test(metrics[0]) if TEST_PREFIX + name in common]
-    objectives, subject_of = search.user_attrs[OBJECTIVES], subjects_of(chosen[0])
+    objectives, subject_of = search.user_attrs[OBJECTIVES], subjects_of((*chosen, *control))
     # First the objectives, by which the configuration was selected.
     for name in dict.fromkeys((*(name for name in objectives if name in tested), *leading_among(tested))):
         volumes, scores = scores_of(TEST_PREFIX + name, metrics)
-        if not np.isfinite(scores).all():
+        # Without a common test volume, there is nothing to compare.
+        if not scores.size or not np.isfinite(scores).all():
             continue
         ours, theirs = scores[: len(chosen)], scores[len(chosen) :]
         is_higher_better = objectives[name] == MAXIMIZE if name in objectives else is_rate(name)

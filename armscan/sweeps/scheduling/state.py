@@ -1,4 +1,4 @@
-"""State of a study: its trials in groups, and facts of each."""
+"""State of a study: its trials by state, and what is known of each."""
 
 from __future__ import annotations
 

@@ -200,10 +200,10 @@ def _not_searched(params: Mapping[str, Value], chosen: Mapping[str, Value], fixe
 
 def _plain(flat: Mapping[str, Any]) -> dict[str, Value]:
     """Return the values of a flattened configuration, whose lists are JSON, as Optuna stores them."""
-    return {key: optuna_value(_listed(value)) for key, value in flat.items()}
+    return {key: optuna_value(_list_or_value(value)) for key, value in flat.items()}
 
 
-def _listed(value: Any) -> Any:
+def _list_or_value(value: Any) -> Any:
     """Return the list that a value describes; the value itself if it describes none, such as the text `[a] b`."""
     with contextlib.suppress(ValueError):
         return json.loads(value) if isinstance(value, str) and value.startswith("[") else value

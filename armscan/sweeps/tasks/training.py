@@ -16,7 +16,15 @@ from omegaconf import DictConfig
 from armscan.agents import Learner
 from armscan.config.defaults import to_plain
 from armscan.errors import CheckpointError, InvalidValueError, TrackingError, TrackingUnavailableError
-from armscan.experiment.build import Experiment, build_experiment, check_keys, on_plane_of, set_up
+from armscan.experiment.build import (
+    Experiment,
+    build_experiment,
+    check_each_seen,
+    check_episodes,
+    check_keys,
+    on_plane_of,
+    set_up,
+)
 from armscan.experiment.job import Invocation, Job
 from armscan.experiment.provenance import place_tags, start_tracking, volume_tags
 from armscan.experiment.results import RunResult
@@ -72,6 +80,9 @@ class TrainingTask:
             raise InvalidValueError(
                 f"agent is {config.agent.get('_target_')!r}, but the trials of this study need one that learns"
             )
+        check_episodes(experiment)
+        # The race compares candidates in as many episodes.
+        check_each_seen("evaluation.episodes", experiment.n_episodes, "validation", experiment.split)
 
     def run(self, attempt: Attempt) -> dict[str, float]:
         """Train with each seed; return the interquartile means of the metrics over the seeds. See `Task.run`.

@@ -27,7 +27,7 @@ class Final(NamedTuple):
     """Rule of a final evaluation.
 
     Args:
-        min_seeds: Seeds that each configuration gets.
+        min_seeds: Seeds that each configuration gets first.
         mean_seeds: Seeds of a configuration on average, at most.
         has_control: Whether the control races, too. Default: True.
         top_k: Number of the best trials that race. Default: 3.

@@ -127,6 +127,8 @@ def test_scores_are_of_the_volumes_that_all_trainings_have():
     added = {key: value for key, value in metrics.items() if key != "test/volume/b/mean_steps"}
     volumes, scores = scores_of("test/mean_steps", [metrics, added])
     assert (volumes, scores.shape) == (["a", "c"], (2, 2))
+    volumes, scores = scores_of("test/mean_steps", [metrics, {"test/volume/d/mean_steps": 1.0}])
+    assert (volumes, scores.size) == ([], 0)
 
 
 @pytest.mark.parametrize("metric", ["mean_steps", "on_plane_5mm_10deg", "on_plane_2.5mm_5deg"])
