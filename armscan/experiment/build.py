@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -167,6 +168,18 @@ def check_each_seen(key: str, n_episodes: int, part: str, split: Split) -> None:
     if n_episodes < n_volumes:
         least = f"at least {n_volumes}: one for each {part} volume"
         raise InvalidValueError(f"{key} is {n_episodes}, but it must be {least}")
+
+
+def check_network(config: DictConfig, overrides: Sequence[str]) -> None:
+    """Check that overrides of the network concern the agent, which may have a network of its own.
+
+    Raises:
+        InvalidValueError: If the agent's configuration does not refer to `network`.
+    """
+    given = next((each for each in overrides if re.match(r"[+~]*network[=.]", each)), None)
+    if given and "${network" not in str(OmegaConf.to_container(config.agent, resolve=False)):
+        agent = config.agent.get("_target_")
+        raise InvalidValueError(f"{given!r} has no effect: {agent} has a network of its own, configured in agent")
 
 
 def check_config(config: DictConfig) -> None:

@@ -12,7 +12,7 @@ from omegaconf import DictConfig
 
 from armscan.agents import Learner
 from armscan.config.command_hints import armscan_command, resume_command
-from armscan.experiment.build import Experiment, check_episodes, check_keys, set_up
+from armscan.experiment.build import Experiment, check_episodes, check_keys, check_network, set_up
 from armscan.experiment.console import print_result_table, print_where_to_look
 from armscan.experiment.job import Invocation
 from armscan.experiment.provenance import start_tracking
@@ -64,6 +64,8 @@ def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict
             with told:
                 setup = set_up(config)
             check_episodes(setup)
+            if isinstance(setup.agent, Learner):
+                check_network(config, invocation.overrides)
             tracked = start_tracking(config, invocation, setup)
         return run_tracked(setup, tracked, invocation.folder, config.tracking.uri, job_label=job.label if job else None)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import json
 import math
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -37,7 +38,8 @@ def folds_table(runs: Iterable[tuple[Path, str]]) -> ResultTable | None:
     # By title, training and fold.
     tested: dict[str, dict[str, dict[str, Evaluation]]] = {}
     for folder, varied in runs:
-        words = dict(word.partition("=")[::2] for word in varied.split())
+        # Values may contain blanks.
+        words = dict(word.partition("=")[::2] for word in re.split(r" (?=[+~]*[\w.@/]+=)", varied))
         if (fold := words.pop(FOLD, None)) is None:
             return None
         training = words.pop(SEED, "")

@@ -8,7 +8,7 @@ import pytest
 from armscan.config.compose import compose
 from armscan.envs import SliceObservation
 from armscan.errors import InvalidValueError
-from armscan.experiment.build import build_experiment, set_up
+from armscan.experiment.build import build_experiment, check_network, set_up
 from armscan.training import Split
 
 
@@ -89,3 +89,10 @@ def test_section_that_builds_something_else_is_refused(phantom, monkeypatch, sec
     config[section] = {}
     with pytest.raises(InvalidValueError, match=f"^{section} builds {{}}, but it must build a "):
         build_experiment(config)
+
+
+@pytest.mark.parametrize("override", ["network=mlp", "network.vector.hidden_sizes=[8]"])
+def test_network_of_an_agent_that_has_its_own_is_refused(override):
+    check_network(compose(["agent=residual_sac", override]), [override])
+    with pytest.raises(InvalidValueError, match=r"'network.*' has no effect: armscan\.agents\.PlaneFinder has"):
+        check_network(compose(["agent=plane_finder", override]), ["agent=plane_finder", override])

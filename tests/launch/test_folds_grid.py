@@ -182,11 +182,12 @@ def test_no_job_is_the_best_of_those_that_are_tested_on_other_wrists():
 
 def test_table_keeps_kinds_of_runs_apart_and_a_grid_without_folds_has_none(tmp_path):
     runs = [
-        (left_by_a_run(tmp_path / f"{fold}-{agent}", f"wrist{fold}", [1.0]), f"agent={agent} data.fold={fold}")
-        for agent in ("sac", "ppo")
+        (left_by_a_run(tmp_path / f"{fold}-{agent[:3]}", f"wrist{fold}", [1.0]), f"agent={agent} data.fold={fold}")
+        # A value may contain blanks.
+        for agent in ("sac", "{lr: 0.1, gamma: 0}")
         for fold in range(2)
     ]
-    titles = ["agent, all folds, agent=sac", "agent, all folds, agent=ppo"]
+    titles = ["agent, all folds, agent=sac", "agent, all folds, agent={lr: 0.1, gamma: 0}"]
     assert [title for title in folds_table(runs).results if title.startswith("agent")] == titles
     assert folds_table([(path, "seed=1") for path, _ in runs]) is None
     assert folds_table([]) is None

@@ -17,7 +17,7 @@ from armscan.config.compose import compose, of_run
 from armscan.config.defaults import MULTIRUN, NOT_SEARCHED, PLAN, RESUME
 from armscan.config.sources import SWEEP
 from armscan.errors import InvalidValueError
-from armscan.experiment.build import check_config
+from armscan.experiment.build import check_config, check_network
 from armscan.launch.launchers import LAUNCHER
 
 STUDY = "study"
@@ -80,9 +80,12 @@ def check_training_overrides(arguments: Sequence[str]) -> None:
     Raises:
         InvalidValueError: If a value is not allowed.
     """
-    config = compose(trial_overrides(StudyCommand.read(arguments).overrides), return_hydra_config=True)
+    overrides = trial_overrides(StudyCommand.read(arguments).overrides)
+    config = compose(overrides, return_hydra_config=True)
     if OmegaConf.select(config, TASK_TARGET) == TRAINING_TASK:
-        check_config(of_run(config)[0])
+        of_trainings = of_run(config)[0]
+        check_config(of_trainings)
+        check_network(of_trainings, overrides)
 
 
 def fixed_by(overrides: Sequence[str]) -> dict[str, Any]:
