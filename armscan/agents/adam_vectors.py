@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import nn
+from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from armscan.agents.mlp_kernels import Adam, Floats, Weights
 
@@ -60,10 +61,10 @@ class AdamVectors:
 
 def flattened(parameters: list[nn.Parameter]) -> Floats:
     """Copy parameters into one vector, make them views of it, and return it."""
-    vector: Floats = torch.cat([each.detach().reshape(-1) for each in parameters]).numpy()
-    for parameter, view in zip(parameters, _views(vector, parameters), strict=True):
-        parameter.data = view
-    return vector
+    vector = parameters_to_vector(parameters).detach()
+    vector_to_parameters(vector, parameters)
+    values: Floats = vector.numpy()
+    return values
 
 
 def _views(vector: Floats, parameters: list[nn.Parameter], *, is_scalar: bool = False) -> list[torch.Tensor]:
@@ -71,5 +72,5 @@ def _views(vector: Floats, parameters: list[nn.Parameter], *, is_scalar: bool = 
     tensor = torch.from_numpy(vector)
     if is_scalar:
         return list(tensor.unbind())
-    ends = np.cumsum([each.numel() for each in parameters])
-    return [tensor[end - each.numel() : end].view_as(each) for end, each in zip(ends, parameters, strict=True)]
+    parts = torch.split(tensor, [each.numel() for each in parameters])
+    return [part.view_as(each) for part, each in zip(parts, parameters, strict=True)]

@@ -11,7 +11,7 @@ from armscan.agents.hyperparameters import check_numbers_of, number
 from armscan.errors import InvalidValueError
 from armscan.utils.validation import check_float, check_ints, check_numbers
 
-MAX_LOOKS, MAX_OFFSET_MM, MAX_UNITS = 20, 100.0, 4096
+MAX_LOOKS, MAX_OFFSET_MM, MAX_LAYER_UNITS = 20, 100.0, 4096
 N_CONVOLUTIONS = 3
 
 
@@ -91,7 +91,7 @@ class FinderParameters:
     def __post_init__(self) -> None:
         check_numbers_of(self)
         for name, n_sizes in (("filters", N_CONVOLUTIONS), ("hidden_sizes", None)):
-            check_ints(f"agent.{name}", getattr(self, name), n_sizes, "", at_least=1, at_most=MAX_UNITS)
+            check_ints(f"agent.{name}", getattr(self, name), n_sizes, "", at_least=1, at_most=MAX_LAYER_UNITS)
         n_offsets = len(self.offsets_mm) if isinstance(self.offsets_mm, list | tuple) else 0
         offsets = check_numbers("agent.offsets_mm", self.offsets_mm, max(n_offsets, 1), "in mm, one for each look")
         if not 2 <= n_offsets <= MAX_LOOKS or offsets[-1] != 0.0 or max(map(abs, offsets)) > MAX_OFFSET_MM:

@@ -6,14 +6,14 @@ and ReLU row by row, for every batch size; other networks compute one row at a t
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from tianshou.utils.net.common import Net
 from tianshou.utils.net.continuous import ContinuousActorProbabilistic
+from tianshou.utils.torch_utils import torch_train_mode
 from torch import nn
 
 from armscan.agents.compute import Compute
@@ -82,7 +82,7 @@ class Inference:
             observations: Observations, shape (n, ...).
             episodes: Episode of each observation, its index among the seeds.
         """
-        with torch.no_grad(), _in_eval_mode(self._actor):
+        with torch.no_grad(), torch_train_mode(self._actor, enabled=False):
             if self._layers is not None:
                 means = torch.from_numpy(_forward(self._layers, np.asarray(observations)))
                 chosen = [self._bounded(mean) for mean in means]
@@ -101,17 +101,6 @@ class Inference:
         if self._is_sampling:
             mean = mean + spread * torch.randn(mean.shape, generator=self._generators[episode]).to(mean.device)
         return self._bounded(mean)
-
-
-@contextlib.contextmanager
-def _in_eval_mode(module: nn.Module) -> Iterator[None]:
-    """Switch off dropout and the like for a while."""
-    was_training = module.training
-    module.eval()
-    try:
-        yield
-    finally:
-        module.train(was_training)
 
 
 def _layers_of(actor: nn.Module) -> list[nn.Module] | None:

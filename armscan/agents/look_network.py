@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import chain, pairwise
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
+from armscan.agents.finder_parameters import FinderParameters
 from armscan.agents.plane_geometry import PlaneGeometry
 
 # Names of the parts of an observation that the network takes.
@@ -49,24 +50,6 @@ class PlaneEstimate(NamedTuple):
         return torch.cat([self.hidden, self.place, self.expected, self.step], dim=1)
 
 
-class PlaneModule(Protocol):
-    """Module that maps observations of several looks to the next plane."""
-
-    @property
-    def geometry(self) -> PlaneGeometry:
-        """Free components and bounds of the planes."""
-
-    @property
-    def calibration(self) -> Tensor:
-        """Calibration factors of the expected errors in mm and in degrees, shape (2,)."""
-
-    def estimate(self, observations: dict[str, Tensor]) -> PlaneEstimate:
-        """Return the estimate at the latest look, from observations with parts of shape (n, n_looks, ...)."""
-
-    def __call__(self, observations: dict[str, Tensor]) -> tuple[tuple[Tensor, Tensor], None]:
-        """Return the next actions, shape (n, n_action), and the expected errors of the planes found so far, (n, 2)."""
-
-
 class LookNetwork(nn.Module):
     """Convolutions over the images of the latest looks, then linear layers that also take the places of these looks.
 
@@ -75,28 +58,17 @@ class LookNetwork(nn.Module):
 
     Args:
         image_shape: Shape of a look's image: tissues, across, depth.
-        n_seen: Number of latest looks that the network sees.
-        n_looks: Number of looks of an episode.
-        filters: Filters of each convolution.
-        hidden_sizes: Units of each linear layer.
+        finder: Looks and sizes of the network.
     """
 
     units: Tensor
     places: Tensor
 
-    def __init__(
-        self,
-        image_shape: Sequence[int],
-        *,
-        n_seen: int,
-        n_looks: int,
-        filters: Sequence[int],
-        hidden_sizes: Sequence[int],
-    ) -> None:
+    def __init__(self, image_shape: Sequence[int], finder: FinderParameters) -> None:
         super().__init__()
         n_tissues, *sides = image_shape
-        self._n_seen, self._n_looks = n_seen, n_looks
-        channels = pairwise([n_seen * n_tissues, *filters])
+        self._n_seen, filters, hidden_sizes = finder.n_seen, finder.filters, finder.hidden_sizes
+        channels = pairwise([finder.n_seen * n_tissues, *filters])
         layers = [
             (nn.Conv2d(n_in, n_out, kernel, stride=2, padding=kernel // 2), nn.ReLU())
             for (n_in, n_out), kernel in zip(channels, KERNELS, strict=True)
@@ -104,7 +76,7 @@ class LookNetwork(nn.Module):
         self.convolutions = nn.Sequential(*chain.from_iterable(layers), nn.Flatten())
         for _ in KERNELS:
             sides = [(side + 1) // 2 for side in sides]
-        n_features = filters[-1] * sides[0] * sides[1] + 4 * n_seen + n_looks
+        n_features = filters[-1] * sides[0] * sides[1] + 4 * finder.n_seen + finder.n_looks
         sizes = pairwise([n_features, *hidden_sizes])
         self.linear = nn.Sequential(*chain.from_iterable((nn.Linear(*each), nn.ReLU()) for each in sizes))
         self.place = nn.Linear(hidden_sizes[-1], 4)
@@ -155,12 +127,7 @@ class FinderModule(nn.Module):
     Args:
         network: Network for the looks.
         geometry: Free components and bounds of the planes, in degrees and mm.
-        offsets_mm: Offset of the next look along the normal from the plane found so far, in mm, after each look; the
-            last is 0.
-        sure: Largest expected errors, in mm and degrees, at which it stops looking. None: it takes all looks.
-        n_averaged: Number of latest looks whose estimates are averaged, weighted by the inverse squares of their
-            expected errors.
-        average_tilts: Whether to average tilts too, or only distances.
+        finder: Offsets of the looks, when it stops looking, and how it averages.
         has_stop: Whether actions end with the component `stop`, as with `env.ends=on_stop`.
     """
 
@@ -169,22 +136,15 @@ class FinderModule(nn.Module):
     calibration: Tensor
 
     def __init__(
-        self,
-        network: LookNetwork,
-        geometry: PlaneGeometry,
-        offsets_mm: Sequence[float],
-        sure: tuple[float, float] | None,
-        *,
-        n_averaged: int,
-        average_tilts: bool,
-        has_stop: bool,
+        self, network: LookNetwork, geometry: PlaneGeometry, finder: FinderParameters, *, has_stop: bool
     ) -> None:
         super().__init__()
         self.network, self.geometry = network, geometry
-        self._n_averaged, self._average_tilts = n_averaged, average_tilts
-        self._is_ever_sure, self._has_stop = sure is not None, has_stop
-        self.register_buffer("offsets", torch.tensor(offsets_mm, dtype=torch.float32), persistent=False)
-        self.register_buffer("sure", torch.tensor(sure or (0.0, 0.0), dtype=torch.float32), persistent=False)
+        self._n_averaged, self._average_tilts, self._has_stop = finder.n_averaged, finder.average_tilts, has_stop
+        # No expected error is below -1: then it takes all looks.
+        sure = [-1.0 if limit is None else limit for limit in (finder.sure_mm, finder.sure_deg)]
+        self.register_buffer("offsets", torch.tensor(finder.offsets_mm, dtype=torch.float32), persistent=False)
+        self.register_buffer("sure", torch.tensor(sure, dtype=torch.float32), persistent=False)
         self.register_buffer("calibration", torch.ones(2))
 
     @property
@@ -237,14 +197,11 @@ class FinderModule(nn.Module):
     def actions(self, estimate: PlaneEstimate) -> Tensor:
         """Return the next actions, shape (n, n_action)."""
         beside_mm = estimate.step @ self.offsets
-        is_last = estimate.step[:, -1] > 0.0
-        if self._is_ever_sure:
-            is_last = is_last | (estimate.expected <= self.sure).all(1)
-        beside_mm = torch.where(is_last, torch.zeros_like(beside_mm), beside_mm)
+        is_last = (estimate.step[:, -1] > 0.0) | (estimate.expected <= self.sure).all(1)
+        beside_mm = beside_mm.masked_fill(is_last, 0.0)
         actions = self.geometry.actions(self.geometry.from_frame(estimate.plane, estimate.place, beside_mm))
         if self._has_stop:
-            stop = torch.where(is_last, torch.ones_like(beside_mm), -torch.ones_like(beside_mm))
-            actions = torch.cat([actions, stop[:, None]], dim=1)
+            actions = torch.cat([actions, 2.0 * is_last[:, None] - 1.0], dim=1)
         return actions
 
     def forward(self, observations: dict[str, Tensor]) -> tuple[tuple[Tensor, Tensor], None]:

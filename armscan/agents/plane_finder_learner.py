@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from armscan.agents.base_learner import SupervisedLearner, diverged, labelled_envs_of
 from armscan.agents.finder_parameters import FinderParameters
-from armscan.agents.look_network import ACTION, IMAGE, FinderModule, LookNetwork, PlaneModule, looks_of
+from armscan.agents.look_network import ACTION, IMAGE, FinderModule, LookNetwork, looks_of
 from armscan.agents.plane_geometry import common_geometry
 from armscan.agents.policy import batch_of
 from armscan.agents.protocols import AgentSetup
@@ -51,26 +51,10 @@ class PlaneFinderLearner(SupervisedLearner):
         self._env_steps_per_update = envs.num_envs * finder.n_looks
         torch.manual_seed(setup.seed)
         space: Any = setup.observation_space
-        network = LookNetwork(
-            space[IMAGE].shape[1:],
-            n_seen=finder.n_seen,
-            n_looks=finder.n_looks,
-            filters=finder.filters,
-            hidden_sizes=finder.hidden_sizes,
-        )
-        sure = None if finder.sure_mm is None or finder.sure_deg is None else (finder.sure_mm, finder.sure_deg)
+        network = LookNetwork(space[IMAGE].shape[1:], finder)
         geometry = common_geometry(labelled_envs_of(envs).rules, finder.n_looks)
-        module = FinderModule(
-            network,
-            geometry,
-            finder.offsets_mm,
-            sure,
-            n_averaged=finder.n_averaged,
-            average_tilts=finder.average_tilts,
-            has_stop=self._has_stop,
-        )
-        self._module: PlaneModule = module
-        super().__init__(module, finder.lr, envs, setup)
+        self._module = FinderModule(network, geometry, finder, has_stop=self._has_stop)
+        super().__init__(self._module, finder.lr, envs, setup)
         # Not to the module, whose forward learning bypasses, and whose geometry requires 32 bits.
         setup.compute.apply_to(network)
         self._calibration_envs = setup.make_validation_envs and setup.make_validation_envs(N_CALIBRATION)
@@ -158,11 +142,11 @@ class PlaneFinderLearner(SupervisedLearner):
             observations, _ = reset_each(envs, seed)
             optima = self._optima(envs)
             for _ in range(self._finder.n_looks - 1):
-                (actions, _), _ = self._module(self._tensors(observations))
+                (actions, _), _ = self._network(self._tensors(observations))
                 if self._has_stop:
                     actions[:, 4] = -1.0
                 observations = envs.step(actions.cpu().numpy())[0]
-            (actions, expected), _ = self._module(self._tensors(observations))
+            (actions, expected), _ = self._network(self._tensors(observations))
             errors = self._module.geometry.errors(self._module.geometry.planes(actions[:, :4]), optima)
             self._module.calibration.mul_(errors.mean(0) / expected.mean(0).clamp(min=1e-6))
         metrics = {}
@@ -203,7 +187,7 @@ class PlaneFinderLearner(SupervisedLearner):
         """Return the next plane, shape (n_action,)."""
         batch = batch_of([observation])
         with torch.no_grad():
-            (actions, expected), _ = self._module(self._tensors(batch))
+            (actions, expected), _ = self._network(self._tensors(batch))
         self.expected_error = (float(expected[0, 0]), float(expected[0, 1]))
         return np.asarray(actions[0].clamp(-1.0, 1.0).cpu().numpy())
 

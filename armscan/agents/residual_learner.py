@@ -10,9 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from armscan.agents.finder_parameters import FinderParameters
-from armscan.agents.look_network import FinderModule, PlaneEstimate
+from armscan.agents.look_network import FinderModule
 from armscan.agents.plane_finder_learner import PlaneFinderLearner
-from armscan.agents.plane_geometry import PlaneGeometry
 from armscan.agents.protocols import AgentSetup
 from armscan.agents.residual_envs import ResidualVectorEnv, feature_space
 from armscan.agents.sac import SAC
@@ -41,20 +40,6 @@ class ResidualModule(nn.Module):
         self.register_buffer("limits", limits, persistent=False)
         # 1 once SAC learns; until then, the planes are exactly the plane finder's.
         self.register_buffer("is_corrected", torch.zeros_like(limits[0]))
-
-    @property
-    def geometry(self) -> PlaneGeometry:
-        """Geometry of the planes."""
-        return self.finder.geometry
-
-    @property
-    def calibration(self) -> Tensor:
-        """Calibration factors of the expected errors in mm and in degrees, shape (2,)."""
-        return self.finder.calibration
-
-    def estimate(self, observations: dict[str, Tensor]) -> PlaneEstimate:
-        """Return the plane finder's estimate at the latest look."""
-        return self.finder.estimate(observations)
 
     def forward(self, observations: dict[str, Tensor]) -> tuple[tuple[Tensor, Tensor], None]:
         """Return the next actions, shape (n, n_action), and the expected errors of the plane finder, shape (n, 2)."""
@@ -92,7 +77,6 @@ class ResidualLearner(PlaneFinderLearner):
         self._pretraining_env_steps = pretraining_env_steps
         super().__init__(parameters, replace(setup, total_env_steps=pretraining_env_steps))
         finder, tilt = self._module, math.sin(math.radians(correction_deg))
-        assert isinstance(finder, FinderModule), "SAC corrects only the pretraining's own module"
         limits = torch.tensor([tilt, tilt, correction_mm, correction_mm], device=self._device)
         sac_setup = replace(
             setup,
@@ -107,7 +91,7 @@ class ResidualLearner(PlaneFinderLearner):
             budget = "training.env_steps"
             message = _of_sac(error).replace(budget, f"{budget} - agent.pretraining_env_steps")
             raise InvalidValueError(message) from error
-        self._network = self._module = self._corrected = ResidualModule(finder, self._sac.actor, limits)
+        self._network = self._corrected = ResidualModule(finder, self._sac.actor, limits)
 
     @property
     def n_env_steps(self) -> int:

@@ -9,7 +9,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from armscan.errors import ChangedVolumesError
 
-# By split (training, validation, test) and the volume's name.
+# By part of the split (training, validation, test) and the volume's name.
 Fingerprints = dict[str, dict[str, str]]
 
 
@@ -31,7 +31,13 @@ def fingerprints_in(record: bytes | Any, where: str) -> Fingerprints:
 
 
 def check_unchanged(then: Mapping[str, Mapping[str, str]], now: Mapping[str, Mapping[str, str]], those_of: str) -> None:
-    """Raise `ChangedVolumesError` if a volume is new, gone, changed or in another split; the message has `those_of`."""
+    """Raise `ChangedVolumesError` if a volume is new, gone, changed or in another part of the split.
+
+    Args:
+        then: Earlier fingerprints.
+        now: Fingerprints of today's volumes.
+        those_of: End of the message "not those that ...".
+    """
     for part, prints in now.items():
         before = then.get(part, {})
         changes = {

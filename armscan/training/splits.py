@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +11,7 @@ from armscan.errors import InvalidValueError
 from armscan.training.fingerprints import Fingerprints
 from armscan.training.subject_splits import PHANTOMS, parts_by_subject
 from armscan.utils.validation import MAX_SEED, check_choice, check_int, check_path
-from armscan.volumes import LabelVolume, load_phantoms, open_dataset
+from armscan.volumes import Dataset, LabelVolume, load_phantoms, open_dataset
 from armscan.volumes.dataset import SPLITS
 from armscan.volumes.phantom import VERSIONS
 
@@ -23,7 +23,7 @@ PARTS = ("training", "validation", "test")
 
 @dataclass(frozen=True)
 class Split:
-    """Volumes by name.
+    """Volumes for training, validation and test, by name.
 
     Args:
         training: Volumes that the agent learns on.
@@ -72,11 +72,11 @@ class Split:
 
     @property
     def parts(self) -> dict[str, dict[str, LabelVolume]]:
-        """The volumes by split and name."""
+        """The volumes by part and name."""
         return {part: getattr(self, part) for part in PARTS}
 
     def fingerprints(self) -> Fingerprints:
-        """Return a checksum of each volume's contents, by split and name."""
+        """Return a checksum of each volume's contents, by part and name."""
         return {
             part: {name: volume.fingerprint for name, volume in volumes.items()} for part, volumes in self.parts.items()
         }
@@ -108,22 +108,31 @@ def phantom_data(
     Raises:
         InvalidValueError: If a number is out of range.
     """
-    check_int("data.n_training", n_training, at_least=1)
-    check_int("data.n_validation", n_validation, at_least=1, at_most=TEST_FIRST_SEED - VALIDATION_FIRST_SEED)
-    check_int("data.n_test", n_test, at_least=1, at_most=MAX_SEED + 1 - TEST_FIRST_SEED)
+    counts = {"training": n_training, "validation": n_validation, "test": n_test}
+    return Split(**_phantoms(counts, first_seed, cache_dir, version))
+
+
+def _phantoms(
+    counts: Mapping[str, int],
+    first_seed: int,
+    cache_dir: str | None,
+    version: int,
+    may_be_none: Collection[str] = (),
+) -> dict[str, dict[str, LabelVolume]]:
+    """Make phantoms for each part of a split; see `phantom_data`. Parts in `may_be_none` may have none."""
+    at_most = {"validation": TEST_FIRST_SEED - VALIDATION_FIRST_SEED, "test": MAX_SEED + 1 - TEST_FIRST_SEED}
+    for part, count in counts.items():
+        check_int(f"data.n_{part}", count, at_least=0 if part in may_be_none else 1, at_most=at_most.get(part))
     check_int("data.first_seed", first_seed, at_least=0)
-    if first_seed + n_training > VALIDATION_FIRST_SEED:
+    if (end := first_seed + counts["training"]) > VALIDATION_FIRST_SEED:
         raise InvalidValueError(
-            f"data.first_seed + data.n_training is {first_seed + n_training}, but it must be at most "
-            f"{VALIDATION_FIRST_SEED}, where the validation phantoms begin"
+            f"data.first_seed + data.n_training is {end}, but it must be at most {VALIDATION_FIRST_SEED}, where the "
+            "validation phantoms begin"
         )
     check_choice("data.version", version, tuple(VERSIONS))
     folder = None if cache_dir is None else check_path("data.cache_dir", cache_dir)
-    return Split(
-        training=load_phantoms(range(first_seed, first_seed + n_training), folder, version),
-        validation=load_phantoms(range(VALIDATION_FIRST_SEED, VALIDATION_FIRST_SEED + n_validation), folder, version),
-        test=load_phantoms(range(TEST_FIRST_SEED, TEST_FIRST_SEED + n_test), folder, version),
-    )
+    firsts = {"training": first_seed, "validation": VALIDATION_FIRST_SEED, "test": TEST_FIRST_SEED}
+    return {part: load_phantoms(range(first, first + counts[part]), folder, version) for part, first in firsts.items()}
 
 
 def nifti_data(
@@ -152,8 +161,15 @@ def nifti_data(
     """
     dataset = open_dataset(check_path("data.path", path))
     parts = parts_by_subject(dataset, {"test": test, "validation": validation}, path, split_seed, folds, fold)
-    ours = {part: {n: v for n, v in dataset.volumes.items() if parts[n] == part} for part in SPLITS}
-    return Split(ours["train"], ours["validation"], ours["test"])
+    return Split(**_by_part(dataset, parts))
+
+
+def _by_part(dataset: Dataset, parts: Mapping[str, str]) -> dict[str, dict[str, LabelVolume]]:
+    """Return the volumes of each part of a split, which manifests call `train`, `validation` and `test`."""
+    return {
+        part: {name: volume for name, volume in dataset.volumes.items() if parts[name] == in_manifest}
+        for part, in_manifest in zip(PARTS, SPLITS, strict=True)
+    }
 
 
 def mixed_data(
@@ -193,26 +209,14 @@ def mixed_data(
     Raises:
         InvalidValueError: If a number is out of range, or the volumes cannot be split this way.
     """
-    n_beside = check_int("data.n_training", n_training, at_least=0)
     given = {"test": test, "validation": validation}
     wanted = {part: each for part, each in given.items() if each != PHANTOMS}
-    phantoms = phantom_data(
-        max(n_beside, 1),
-        1 if "validation" in wanted else n_validation,
-        1 if "test" in wanted else n_test,
-        first_seed,
-        cache_dir,
-        version,
-    )
+    counts = {"training": n_training, "validation": n_validation, "test": n_test} | dict.fromkeys(wanted, 0)
+    phantoms = _phantoms(counts, first_seed, cache_dir, version, may_be_none={"training", *wanted})
     dataset = open_dataset(check_path("data.path", path))
     if n_volumes is not None:
         check_int("data.n_volumes", n_volumes, at_least=1, at_most=len(dataset.volumes))
     names = sorted(dataset.volumes)[:n_volumes]
     dataset = replace(dataset, volumes={name: dataset.volumes[name] for name in names})
     parts = parts_by_subject(dataset, wanted, path, split_seed, folds, fold)
-    ours = {part: {name: dataset.volumes[name] for name in names if parts[name] == part} for part in SPLITS}
-    return Split(
-        {**ours["train"], **(phantoms.training if n_beside else {})},
-        ours["validation"] if "validation" in wanted else phantoms.validation,
-        ours["test"] if "test" in wanted else phantoms.test,
-    )
+    return Split(**{part: volumes | phantoms[part] for part, volumes in _by_part(dataset, parts).items()})

@@ -42,8 +42,8 @@ def n_folds(folds: object, n_subjects: int) -> int:
     return check_int("data.folds", folds, at_least=2, at_most=n_subjects)
 
 
-def tested(subjects: Sequence[str], folds: object, fold: object, seed: int) -> tuple[list[str], list[str]]:
-    """Return the subjects of a fold, which are tested on, and of the fold after it.
+def test_and_next_fold(subjects: Sequence[str], folds: object, fold: object, seed: int) -> tuple[list[str], list[str]]:
+    """Return the subjects of the test fold, and those of the fold after it.
 
     Args:
         subjects: All subjects, each once.
@@ -91,7 +91,7 @@ def parts_by_subject(
                 f"data.folds is {folds!r}, which says what is tested on, but data.test is "
                 f"{wanted.get('test', PHANTOMS)!r}: it must be null"
             )
-        test, after = tested(list(dict.fromkeys(dataset.subjects.values())), folds, fold, split_seed)
+        test, after = test_and_next_fold(list(dict.fromkeys(dataset.subjects.values())), folds, fold, split_seed)
         of_next = {"validation": after} if "validation" in wanted and wanted["validation"] is None else {}
         wanted = {**wanted, "test": test, **of_next}
     elif dataset.splits is not None and all(each is None for each in wanted.values()):

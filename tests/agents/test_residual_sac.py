@@ -70,22 +70,22 @@ def test_corrections_begin_after_the_teaching_and_leave_the_plane_finder_as_it_i
     learner.learn(N_TAUGHT)
     observation, _ = env.reset(seed=0)
     looks = learner._tensors(batch_of([observation]))
-    found = learner._module.finder(looks)[0][0]
-    assert torch.equal(learner._module(looks)[0][0], found)
+    found = learner._network.finder(looks)[0][0]
+    assert torch.equal(learner._network(looks)[0][0], found)
     taught = finder_weights(learner)
     learner.learn(40)
     assert all(torch.equal(w, taught[name]) for name, w in finder_weights(learner).items())
-    assert not torch.equal(learner._module(looks)[0][0], found)
+    assert not torch.equal(learner._network(looks)[0][0], found)
 
 
 def test_corrections_stay_within_their_limits(corrected):
     learner, env = corrected
     with torch.no_grad():
-        learner._module.actor.mu.model[0].bias.fill_(100.0)
+        learner._network.actor.mu.model[0].bias.fill_(100.0)
     looks = learner._tensors(batch_of([env.reset(seed=0)[0]]))
-    geometry, (actions, _) = learner._module.geometry, learner._module(looks)[0]
+    geometry, (actions, _) = learner._module.geometry, learner._network(looks)[0]
     estimate = learner._module.estimate(looks)
-    wanted = geometry.from_frame(estimate.plane, estimate.place + learner._module.limits, torch.tensor([9.0]))
+    wanted = geometry.from_frame(estimate.plane, estimate.place + learner._network.limits, torch.tensor([9.0]))
     torch.testing.assert_close(geometry.planes(actions), wanted, atol=1e-3, rtol=0)
 
 
