@@ -53,7 +53,7 @@ class Exhaustive:
     The middle is a rotation of 0 and half the bound of a translation. Each plane is visited once, in order of its
     distance from the middle, counted in steps; ties go to the smaller component. No plane lies between the last step
     within the range and its end. If all planes were visited and none ended the episode, the agent stays at the one with
-    the best reward.
+    the best reward. Where an episode ends only after a number of steps, the last step takes that plane, too.
 
     Components that are free but not swept are held at 0 degrees or 0 mm: the plane straight across the arm with the
     whole hand in the picture. (The middle of tx, normalised 0, would push half of the hand out of it.) The agent never
@@ -105,15 +105,25 @@ class Exhaustive:
                 f"agent.swept is null, for all free components: {', '.join(free)}; but it must be one or two, because "
                 "a grid over more takes thousands of planes: name them, as in agent.swept=[rz,ty]"
             )
-        return ExhaustiveAgent(free, swept, step_mm=self.step_mm, step_deg=self.step_deg)
+        return ExhaustiveAgent(free, swept, step_mm=self.step_mm, step_deg=self.step_deg, n_steps=setup.n_steps)
 
 
 class ExhaustiveAgent:
-    """Goes through planes in the order of `Exhaustive`, with actions of the `free` components."""
+    """Goes through planes in the order of `Exhaustive`, with actions of the `free` components.
 
-    def __init__(self, free: Sequence[str], swept: Sequence[str], *, step_mm: float, step_deg: float) -> None:
+    Args:
+        free: Names of an action's components.
+        swept: Names of the components to sweep.
+        step_mm: Distance between planes along swept translations, in mm.
+        step_deg: Angle between planes about swept rotations, in degrees.
+        n_steps: Number of steps of an episode; see `AgentSetup`.
+    """
+
+    def __init__(
+        self, free: Sequence[str], swept: Sequence[str], *, step_mm: float, step_deg: float, n_steps: int | None
+    ) -> None:
         self._free, self._swept = tuple(free), tuple(swept)
-        self._step_mm, self._step_deg = step_mm, step_deg
+        self._step_mm, self._step_deg, self._n_steps = step_mm, step_deg, n_steps
 
     def begin(self, *, seed: int, bounds: ActionBounds) -> None:
         """Begin an episode with the middle plane."""
@@ -127,8 +137,8 @@ class ExhaustiveAgent:
         if 0 < self._n_looked_at <= len(self._planes):
             self._rewards.append(reward)
         self._n_looked_at += 1
-        are_left = self._n_looked_at <= len(self._planes)
-        chosen = self._n_looked_at - 1 if are_left else int(np.argmax(self._rewards))
+        is_answer = self._n_looked_at > len(self._planes) or self._n_looked_at == self._n_steps
+        chosen = int(np.argmax(self._rewards)) if is_answer and self._rewards else self._n_looked_at - 1
         return np.array(self._planes[chosen])
 
     def planes(self, bounds: ActionBounds) -> FloatArray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -26,7 +26,8 @@ class OptunaSearch:
 
     Each episode is a new study in memory. The reward of the start is not passed on, because no agent is told which
     plane the start is. The named sampler proposes every plane, even with one free component, for which CMA-ES in
-    earlier versions of Optuna fell back to random planes.
+    earlier versions of Optuna fell back to random planes. Where an episode ends only after a number of steps, the last
+    step takes the best plane.
 
     Raises:
         InvalidValueError: If a value is impossible.
@@ -52,15 +53,20 @@ class OptunaSearch:
 
         # Optuna logs a line for every study, so for every episode, and warns that the GP sampler has no accelerator.
         optuna.logging.set_verbosity(optuna.logging.ERROR)
-        return OptunaAgent(setup.action_names, self)
+        return OptunaAgent(setup.action_names, self, setup.n_steps)
 
 
 class OptunaAgent:
-    """Agent that asks a study for planes and tells it their rewards; `names` are those of the action's components."""
+    """Agent that asks a study for planes and tells it their rewards.
 
-    def __init__(self, names: Sequence[str], search: OptunaSearch) -> None:
-        self._names = tuple(names)
-        self._search = search
+    Args:
+        names: Names of an action's components.
+        search: Sampler of the study.
+        n_steps: Number of steps of an episode, the last of which takes the best plane; see `AgentSetup`.
+    """
+
+    def __init__(self, names: Sequence[str], search: OptunaSearch, n_steps: int | None) -> None:
+        self._names, self._search, self._n_steps = tuple(names), search, n_steps
 
     def begin(self, *, seed: int, bounds: ActionBounds) -> None:
         """Begin a study, with a sampler seeded with `seed`."""
@@ -73,8 +79,13 @@ class OptunaAgent:
         """Report the reward of the last plane; return the next one, shape (n_action,)."""
         if self._trial is not None:
             self._study.tell(self._trial, reward)
+            if self._trial.number + 2 == self._n_steps:
+                return self._action(self._study.best_params)
         self._trial = trial = self._study.ask()
-        return np.array([-1.0 if name == STOP else trial.suggest_float(name, -1.0, 1.0) for name in self._names])
+        return self._action({name: trial.suggest_float(name, -1.0, 1.0) for name in self._names if name != STOP})
+
+    def _action(self, plane: Mapping[str, float]) -> FloatArray:
+        return np.array([plane.get(name, -1.0) for name in self._names])
 
 
 def _sampler(search: OptunaSearch, seed: int) -> BaseSampler:

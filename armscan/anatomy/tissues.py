@@ -92,6 +92,12 @@ class MetricTissue:
                 f"eps_mm of label {self.label} is {self.eps_mm:g}, but with pixels of {across_mm:g} x {depth_mm:g} mm "
                 f"it must be at most {MAX_EPS_PX * min(across_mm, depth_mm):g}, {MAX_EPS_PX:g} pixels"
             )
+        if ROUNDING * self.eps_mm < max(across_mm, depth_mm):
+            raise InvalidValueError(
+                f"eps_mm of label {self.label} is {self.eps_mm:g}, but with pixels of {across_mm:g} x {depth_mm:g} mm "
+                f"it must be at least {max(across_mm, depth_mm):g}: below, pixels have no neighbours; "
+                "take clustering=pixels, or a larger eps_mm"
+            )
         half_widths = disc_half_widths(ROUNDING * self.eps_mm, across_mm, depth_mm)
         return Neighbourhood(half_widths, math.ceil(self.density * count_disc_pixels(half_widths)))
 
@@ -111,7 +117,8 @@ PIXEL_TISSUES = Tissues(
     PixelTissue(label=3, eps_px=1.1, min_samples=4),
 )
 
-# Finds what the pixel mode finds at its own spacing, and the same at any other with pixels of up to about 0.55 mm.
+# Finds what the pixel mode finds at its own spacing, and the same at any other with pixels of up to about 0.55 mm. From
+# 0.6 mm on, the artery's pixels have no neighbours.
 METRIC_TISSUES = Tissues(
     MetricTissue(label=1, eps_mm=1.6, density=0.94),
     MetricTissue(label=2, eps_mm=1.2, density=0.62),

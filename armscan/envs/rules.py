@@ -98,6 +98,11 @@ class Rules:
             flat_space(boxes) if self._is_flat else MultiBoxSpace(boxes)
         )
 
+    @property
+    def n_steps(self) -> int | None:
+        """Number of steps of an episode whose last plane is the answer; None if the first success ends it."""
+        return None if self.ends == ON_REWARD else self.max_steps
+
     def look(self, scenes: Sequence[Scene], actions: Sequence[ManipulatorAction]) -> list[View]:
         """Look at one plane in each scene; several are looked at together, on all cores.
 

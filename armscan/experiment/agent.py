@@ -56,6 +56,7 @@ def make_agent(
         total_env_steps=total_env_steps,
         seed=seed,
         compute=build_section(config, "compute", Compute),
+        n_steps=env.get_wrapper_attr("rules").n_steps,
         make_validation_envs=None if validation is None else _vector_envs(env_factory.undeformed(), validation),
     )
     agent = algorithm.agent(setup)

@@ -41,17 +41,20 @@ def evaluate_baselines(
         seed: Seed of the first episode; the others follow from it.
         on_plane: Limits within which a plane counts as the labelled one. Default: those of `Evaluation`.
     """
-    names = tuple(env.get_wrapper_attr("action_names"))
+    rules = env.get_wrapper_attr("rules")
+    names = tuple(rules.action_names)
     agents: dict[str, Agent] = {RANDOM: RandomAgent(len(names))}
     free = [name for name in names if name in COMPONENTS]
     if len(free) == 1:
         steps = Exhaustive()
         step = f"{steps.step_deg:g} deg" if free[0] in ROTATIONS else f"{steps.step_mm:g} mm"
-        agents[f"sweep {step}"] = ExhaustiveAgent(names, free, step_mm=steps.step_mm, step_deg=steps.step_deg)
-    rules = _rules_of(env.get_wrapper_attr("rules"))
+        agents[f"sweep {step}"] = ExhaustiveAgent(
+            names, free, step_mm=steps.step_mm, step_deg=steps.step_deg, n_steps=rules.n_steps
+        )
+    known = _rules_of(rules)
     evaluations = {}
     for name, agent in agents.items():
-        file = _file(name, rules, n_episodes, seed) if rules else None
+        file = _file(name, known, n_episodes, seed) if known else None
         evaluation = _cached(file) if file else None
         if evaluation is None:
             evaluation = evaluate(agent, env, n_episodes=n_episodes, seed=seed)

@@ -43,6 +43,11 @@ class HostCheck:
         named = [environ.get("HTTP_HOST", "")]
         if "HTTP_ORIGIN" in environ:
             named.append(urlsplit(environ["HTTP_ORIGIN"]).netloc)
+        try:
+            # Bottle drops bytes that are not UTF-8, so that its path would not be the one checked here.
+            environ.get("PATH_INFO", "").encode("latin-1").decode()
+        except UnicodeError:
+            return False
         is_safe = environ["REQUEST_METHOD"] in SAFE_METHODS
         is_from_elsewhere = not is_safe and environ.get("HTTP_SEC_FETCH_SITE") in FROM_ELSEWHERE
         return not is_from_elsewhere and all(any(fnmatchcase(name, host) for host in self._hosts) for name in named)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from armscan.agents import Exhaustive, Learner, Random
+from armscan.agents import Exhaustive, Learner, OptunaSearch, Random
 from armscan.envs import ArmscanEnv
 from armscan.envs.actions import ActionBounds
 from armscan.errors import InvalidValueError
@@ -83,6 +83,22 @@ def test_sweep_stays_at_the_best_plane_after_all_were_seen(phantom):
     np.testing.assert_allclose((swept[:5, 0] + 1) * 11, [11, 6, 16, 1, 21])
     # After the sweep, its best plane is repeated, and further rewards are ignored.
     assert (swept[5:] == swept[2]).all()
+
+
+@pytest.mark.parametrize("algorithm", [Exhaustive(), OptunaSearch()], ids=lambda algorithm: type(algorithm).__name__)
+@pytest.mark.parametrize("max_steps", [1, 2, 7, 60])
+def test_search_ends_an_episode_of_a_number_of_steps_at_its_best_plane(phantom, algorithm, max_steps):
+    env = ArmscanEnv([phantom], ends="on_budget", max_steps=max_steps)
+    env_factory, _ = ENV_FACTORIES["vector"]
+    agent = algorithm.agent(setup_for(env_factory, phantom, action_names=("ty",), n_steps=env.rules.n_steps))
+    for seed in range(3):
+        observation, info = env.reset(seed=seed)
+        agent.begin(seed=seed, bounds=BOUNDS)
+        told, rewards = info["reward"], []
+        for _ in range(max_steps):
+            observation, told, *_ = env.step(agent.act(observation, told))
+            rewards.append(told)
+        assert rewards[-1] == max(rewards)
 
 
 def test_sweep_holds_the_other_free_components_at_the_plane_straight_across(phantom):

@@ -32,6 +32,12 @@ def test_metric_tissue_refuses_impossible_pixels(pixel_mm):
         MetricTissue(1, 1.0, 0.5).neighbourhood(pixel_mm)
 
 
+@pytest.mark.parametrize("pixel_mm", [(0.27, 0.7), (0.7, 0.27)])
+def test_metric_tissue_refuses_pixels_without_neighbours(pixel_mm):
+    with pytest.raises(InvalidValueError, match=r"eps_mm of label 3 is 0\.6, .* must be at least 0\.7"):
+        METRIC_TISSUES.artery.neighbourhood(pixel_mm)
+
+
 def test_metric_clusters_score_labelled_planes_at_every_spacing(dataset):
     """One setting serves all: labelled planes seen with finer and with coarser pixels, up to 0.55 mm."""
     for volume in dataset.values():

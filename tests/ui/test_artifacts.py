@@ -78,6 +78,8 @@ def test_page_among_the_artifacts_runs_no_script(dashboard):
     assert answer.headers["Content-Type"].startswith("text/html")
     assert answer.headers["Content-Security-Policy"] == "sandbox"
     assert answer.headers["X-Content-Type-Options"] == "nosniff"
+    for place in ("%ffartifacts", "artifacts%ff"):
+        assert requests.get(f"{address}/{place}/{study._study_id}/abc", timeout=60).status_code == 403
     assert "Content-Security-Policy" not in requests.get(f"{address}/api/studies", timeout=60).headers
 
 
