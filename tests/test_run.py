@@ -274,7 +274,7 @@ def test_run_on_labelmap_files(tmp_path, data_folder):
             ["agent=exhaustive_grid", "projection=zy", "agent.step_mm=0.01", "agent.step_deg=0.01"],
             "agent.step_mm is 0.01 and agent.step_deg is 0.01, which give ",
         ),
-        (["obs=cluster,action_reward"], "Ambiguous value for argument 'obs=cluster,action_reward' 1. To use it"),
+        (["obs=cluster,action_reward"], "'obs=cluster,action_reward' gives several values: add -m"),
         (["seed=-1"], "seed is -1, but it must be a whole number of at least 0"),
         (["stack=0"], "stack is 0, but it must be a whole number of at least 1"),
         (

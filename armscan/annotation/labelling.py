@@ -76,7 +76,7 @@ def label(options: LabellingOptions) -> tuple[list[tuple[LabelVolume, FoundPlane
         _write_picture(options.pictures / f"{name}.png", volume, plane.action, options.tissues)
         if options.markups:
             write_markup(options.pictures / f"{name}{MARKUP_SUFFIX}", volume, plane.action)
-        record_planes(options.data, {name: (plane.action, plane.score)})
+        record_planes(options.data, {name: (plane.action, plane.score)}, read_with=dataset.manifest)
         labelled.append((volume, plane))
     return labelled, failures
 

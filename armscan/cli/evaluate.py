@@ -108,7 +108,7 @@ def evaluate(
 ) -> None:
     """Evaluate or record an agent on any volumes.
 
-    RUN is an MLflow run ID or its first four or more characters. With --agent, any KEY=VALUE of armscan run configures
+    RUN is an MLflow run ID or its first characters. With --agent, any KEY=VALUE of armscan run configures
     the agent instead, experiment=PRESET included.
 
     The rules of the episodes and --device are the agent's own by default. docs/metrics.md explains the metrics,
@@ -160,6 +160,8 @@ def _evaluate(
     from armscan.evaluation import report_tables
     from armscan.evaluation.track import evaluate_and_track
     from armscan.experiment.console import print_result_table, print_where_to_look
+    from armscan.experiment.results import few_wrists
+    from armscan.training import TRAINING
     from armscan.utils.console import wide_console
 
     report, file = evaluate_and_track(prepared, store, n_episodes=n_episodes, seed=seed, changes=changes, out=out)
@@ -168,7 +170,8 @@ def _evaluate(
         console.print(part)
     tables = report.tables()
     for label, table in tables.items():
-        print_result_table(label, table, how=label == [*tables][-1])
+        notes = [] if label == TRAINING else few_wrists({"": report.by_split[label]})
+        print_result_table(label, table, notes, how=label == [*tables][-1], of=label)
     print_where_to_look(Path.cwd(), store["uri"], files=(str(file),))
 
 

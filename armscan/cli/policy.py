@@ -31,7 +31,7 @@ def policy() -> None:
 def export(run: str, out: Path, tracking: str, trust: bool) -> None:
     """Export the policy of RUN as an MLflow and ONNX model.
 
-    RUN is an MLflow run ID or its first four or more characters. The model is made from the checkpoint of the run;
+    RUN is an MLflow run ID or its first characters. The model is made from the checkpoint of the run;
     docs/policy.md describes its input and output.
     """
     # Deferred: command-line errors are reported before these are loaded.
@@ -55,7 +55,7 @@ def export(run: str, out: Path, tracking: str, trust: bool) -> None:
 def register(run: str, name: str, tracking: str, trust: bool) -> None:
     """Register the policy of RUN in MLflow's model registry.
 
-    RUN is an MLflow run ID or its first four or more characters. Each call registers a new version, which gets
+    RUN is an MLflow run ID or its first characters. Each call registers a new version, which gets
     the alias champion: models:/NAME@champion.
     """
     from armscan.runs.policy_registry import register_policy

@@ -95,7 +95,7 @@ def list_runs(form: str, children: bool, tracking: str, sort: str, limit: int | 
 def show(run: str, tracking: str) -> None:
     """Show everything about a run.
 
-    RUN is an MLflow run ID or its first four or more characters.
+    RUN is an MLflow run ID or its first characters.
     """
     from armscan.runs.show import show as show_run
     from armscan.tracking import find_run
@@ -147,7 +147,7 @@ def stop(target: str, storage: str, tracking: str) -> None:
     """Stop a trial, a study, or a run of this machine.
 
     STUDY is the name of a study: its trials are requeued at their next report, and the same command resumes it.
-    RUN is an MLflow run ID or its first four or more characters. A trial ends at its next report, as pruned, and counts
+    RUN is an MLflow run ID or its first characters. A trial ends at its next report, as pruned, and counts
     as finished; a run outside a study is interrupted as by Ctrl-C.
     """
     from armscan.runs.stop import interrupt, target_of
@@ -217,7 +217,7 @@ def sync(folder: Path, tracking: str | None, trust: bool) -> int:
 def reproduce(run: str, dry_run: bool, out: Path | None, tracking: str, trust: bool) -> int:
     """Repeat a run, and compare every metric.
 
-    RUN is an MLflow run ID or its first four or more characters. Nothing is checked out or installed: differences in
+    RUN is an MLflow run ID or its first characters. Nothing is checked out or installed: differences in
     code, packages and machine are listed. The volumes must be the same. The new run has the configuration and the seed
     of the old one, and is tracked beside it. Exit code: 0 if all metrics are equal (with --dry-run: if nothing
     differs), else 1.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import traceback
 
 from hydra.errors import (
@@ -21,6 +22,8 @@ from armscan.errors import ArmscanError, in_one_line, listed, print_error
 from armscan.utils.files import FULL_DISK
 
 TRACEBACKS = "ARMSCAN_TRACEBACKS"
+# Keys of a folder of volumes, which phantoms do not have.
+OF_FOLDER = ("data.path", "data.folds", "data.fold", "data.validation", "data.test")
 
 
 def print_mistake(error: BaseException) -> bool:
@@ -36,13 +39,16 @@ def one_line_message(error: BaseException) -> str | None:
     """Return a user's mistake and the allowed values in one line; None if the error is not a user's mistake."""
     text = in_one_line(error)
     if (ours := _armscan_error(error)) is not None:
-        return _named(str(ours), text.rpartition("full_key: ")[2])
+        _, found, section = text.rpartition("full_key: ")
+        return _named(str(ours), section) if found else str(ours)
     match error:
         case MissingConfigException(options=options) if options:
             group, _, choice = str(error.missing_cfg_file).rpartition("/")
             return f"{group} is {choice!r}, but it must be {listed(options)}"
         case ConfigCompositionException(__cause__=ConfigAttributeError() | ConfigKeyError() as unknown):
             return _unknown_key(unknown)
+        case HydraException() if several := re.match("Ambiguous value for argument '(.*?)' 1", text):
+            return f"{several[1]!r} gives several values: add -m to try each of them, or write a list as KEY=[A,B]"
         case OverrideParseException():
             return f"{error.override!r} cannot be read: what follows the options must be key=value"
         case MissingMandatoryValue():
@@ -90,4 +96,6 @@ def _unknown_key(error: ConfigAttributeError | ConfigKeyError) -> str:
     keys = [str(key) for key in node] if isinstance(node, DictConfig) else []
     allowed = [key for key in keys if not key.startswith("_") and key != "hydra"]
     only = f", but only {listed(allowed)}" if allowed else ""
+    if error.full_key in OF_FOLDER:
+        only += f": {error.full_key} needs data=nifti or data=mixed"
     return f"there is no key {str(error.key)!r} {f'in {parent}' if parent else 'at the top'}{only}"

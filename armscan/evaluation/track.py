@@ -87,7 +87,7 @@ def evaluate_and_track(
         for group, metrics in report.metrics().items():
             named = {f"{group}/{name}": value for name, value in metrics.items()}
             tracked.log_metrics(named, n_env_steps=source.n_env_steps)
-        own = FOLDER / f"{file_name(f'{source.name}-{data}')}-{tracked.run_id[:ID_CHARS]}{SUFFIX}"
+        own = FOLDER / f"{file_name(source.name, data, tracked.run_id[:ID_CHARS])}{SUFFIX}"
         file = out or own
         text = json.dumps(report.to_dict(), indent=1, allow_nan=False)
         atomic_write(file, text, follow_link=True)

@@ -33,7 +33,7 @@ def record_video(applied: PreparedAgent, *, n_episodes: int, seed: int, out: Pat
     check_out(folder / "video", folder, "video")
     source = applied.source
     which = [source.run.run_id[:ID_CHARS]] if source.run else []
-    name = file_name("-".join([source.name, data_name(applied.data), *which, f"seed{seed}"]))
+    name = file_name(source.name, data_name(applied.data), *which, f"seed{seed}")
     files = [folder / f"{name}{suffix}" for suffix in SUFFIXES]
     with tempfile.TemporaryDirectory() as made_in:
         made = [Path(made_in) / f"video{suffix}" for suffix in SUFFIXES]

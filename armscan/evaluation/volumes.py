@@ -21,6 +21,8 @@ from armscan.volumes.phantom import VERSIONS
 
 # Above the seeds of a run's phantoms: its test phantoms begin a million below.
 PHANTOMS_FIRST_SEED = 3_000_000
+# Names of files have at most 255 bytes.
+MAX_PART_BYTES = 50
 Volumes = dict[str, LabelVolume]
 
 
@@ -81,12 +83,13 @@ def volume_groups(data: str | None, n_phantoms: int, own: Callable[[], Split], v
 
 def data_name(data: str | None) -> str:
     """Return the name of the volumes for files and runs."""
-    return "own volumes" if data is None else Path(data).resolve().name
+    return "configured volumes" if data is None else Path(data).resolve().name
 
 
-def file_name(text: str) -> str:
-    """Return a string as a valid file name."""
-    return re.sub(r"[^\w.\-]+", "-", text)
+def file_name(*parts: str) -> str:
+    """Return strings as a valid file name, each shortened so that up to four of them, and an ending, fit."""
+    valid = (re.sub(r"[^\w.\-]+", "-", part).encode() for part in parts)
+    return "-".join(part[:MAX_PART_BYTES].decode(errors="ignore") for part in valid)
 
 
 def check_out(file: Path, out: Path | None, what: str) -> None:

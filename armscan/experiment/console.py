@@ -19,7 +19,9 @@ from armscan.utils.console import print_sentence, wide_console
 from armscan.utils.run_files import ID_CHARS
 
 
-def print_result_table(title: str, table: ResultTable, notes: Iterable[str] = (), *, how: bool = True) -> None:
+def print_result_table(
+    title: str, table: ResultTable, notes: Iterable[str] = (), *, how: bool = True, of: str = ""
+) -> None:
     """Print a table of results that fits the terminal.
 
     Args:
@@ -27,6 +29,7 @@ def print_result_table(title: str, table: ResultTable, notes: Iterable[str] = ()
         table: Table to print.
         notes: Notes below the table, one sentence each. Default: none.
         how: Whether to explain how its figures are computed. Default: True.
+        of: What the result is of, where a command prints several. Default: nothing.
     """
     console = wide_console()
     console.print(Text(title, style="italic"))
@@ -37,7 +40,7 @@ def print_result_table(title: str, table: ResultTable, notes: Iterable[str] = ()
     for note in notes:
         print_sentence(f"note: {note}")
     if table.headline:
-        print_sentence(f"result: {table.headline}")
+        print_sentence(f"result{of and f' ({of})'}: {table.headline}")
 
 
 def print_jobs(outcomes: Mapping[str, JobOutcome], run_ids: Mapping[str, str]) -> ResultTable:

@@ -48,7 +48,10 @@ VOLUME_PREFIX = "volume/"
 NAMES = {group_of(name): name for name in (TEST, TRAINING)} | {"validation": LAST_VALIDATION}
 # With fewer wrists intervals are clearly too narrow: docs/metrics.md.
 MIN_WRISTS = 8
-WHAT_HELPS = "more wrists, data=mixed, or cross-validation (data.folds=leave_one_out) would help"
+WHAT_HELPS = (
+    "more wrists would help: of phantoms data.n_validation and data.n_test, of a folder data=mixed or cross-validation "
+    "(data.folds=leave_one_out)"
+)
 
 
 @dataclass(frozen=True)
@@ -196,8 +199,16 @@ def volume_notes(test: MetricEstimates, validation: MetricEstimates | None = Non
                 "the intervals do not overlap: volumes differ more than episodes do, and other wrists may lie anywhere "
                 f"between or outside; {WHAT_HELPS}"
             ]
-    numbers = {TEST: test.n_subjects} | ({VALIDATION: validation.n_subjects} if validation is not None else {})
-    few = [counted(n, f"{name.split()[0]} wrist") for name, n in numbers.items() if n < MIN_WRISTS]
+    return few_wrists({"test ": test} | ({"validation ": validation} if validation is not None else {}))
+
+
+def few_wrists(figures: Mapping[str, MetricEstimates]) -> list[str]:
+    """Return a note if intervals come from too few wrists.
+
+    Args:
+        figures: Metrics by the word that describes the wrists, which ends with a blank, or is empty.
+    """
+    few = [counted(each.n_subjects, f"{of}wrist") for of, each in figures.items() if each.n_subjects < MIN_WRISTS]
     if not few:
         return []
     return [

@@ -24,7 +24,7 @@ from armscan.experiment.build import set_up
 from armscan.experiment.provenance import place_tags, volume_tags
 from armscan.experiment.runner import run_tracked
 from armscan.tracking import TrackedRun, TrackingStore, check_run_id, check_version, find_run, open_existing_store, sync
-from armscan.tracking.tags import FOLDER_TAG, GRID_TAG
+from armscan.tracking.tags import FOLDER_TAG, GRID_TAG, STUDY_TAG
 from armscan.training import Fingerprints, check_unchanged, fingerprints_in, resume_from_checkpoint
 from armscan.utils.files import SQLITE_PREFIX, remove_unfinished, sha256, sqlite_file
 from armscan.utils.run_files import (
@@ -151,7 +151,7 @@ def _read(words: Sequence[str]) -> tuple[str, str]:
         if not equals or key not in (RESUME, TRACKING_URI):
             raise InvalidValueError(
                 f"{word!r} cannot be combined with {RESUME}=, because a run keeps its original configuration: "
-                f"only {TRACKING_URI}= may be added"
+                f"only {TRACKING_URI}= and {TRUST} may be added"
             )
         if key in values and key == RESUME and values[key] != text:
             raise InvalidValueError(f"{RESUME} names {values[key]!r} and {text!r}, but one run is resumed at a time")
@@ -162,6 +162,8 @@ def _read(words: Sequence[str]) -> tuple[str, str]:
 def _folder_of(run: Run) -> Path:
     """Return the folder of a run that this version can continue with."""
     run_id, tags = run.info.run_id, run.data.tags
+    if STUDY_TAG in tags and FOLDER_TAG not in tags:
+        raise ResumeError(f"run {run_id} belongs to the study {printable(tags[STUDY_TAG])}: type its command again")
     if FOLDER_TAG not in tags:
         raise ResumeError(
             f"run {run_id} cannot be resumed: it was not started by armscan run, which tags a run with its folder"

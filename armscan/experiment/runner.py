@@ -126,7 +126,7 @@ def run_tracked(
                 # Deferred: exporting a policy loads more than training does, and comes last.
                 from armscan.policies.build import save_policy
 
-                save_policy(setup.agent, setup.test_env, tracked, folder, tell)
+                save_policy(setup.agent, setup.test_env, tracked, folder, tell, slice_px=setup.smallest_slice_px)
     if job_label is None:
         files = (RESULTS_PAGE, *((LEARNING_CURVE_FILE,) if result else ()), VIDEO_FILE)
         print_where_to_look(folder, tracking_uri, files=files)

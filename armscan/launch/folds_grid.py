@@ -45,8 +45,11 @@ def with_folds(words: Sequence[str]) -> list[str]:
     if folds is None:
         return list(words)
     # Deferred: command-line errors are reported before these are loaded.
-    from armscan.training.subject_splits import n_folds
+    from armscan.training.subject_splits import check_folds, n_folds
     from armscan.volumes.dataset import subjects_in
 
+    if path is None:
+        raise InvalidValueError("data.path is not set, but it must be: give data.path=VALUE")
+    check_folds(folds, data.get("test"))
     count = n_folds(folds, len(set(subjects_in(path, n_volumes))))
     return [MULTIRUN[0], *overrides, f"{FOLD}={','.join(map(str, range(count)))}"]

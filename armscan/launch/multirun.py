@@ -236,7 +236,8 @@ def _pool_folds(
 ) -> bool:
     """Print one table over all folds of a cross-validation, and save it above the table of the jobs; False without."""
     from armscan.experiment.console import print_result_table
-    from armscan.launch.folds_table import folds_table, keep_table
+    from armscan.experiment.results import few_wrists
+    from armscan.launch.folds_table import AGENT, folds_table, keep_table
 
     finished = [run for run in runs if outcomes[run.data.tags[JOB_TAG]].failure is None]
     table = folds_table((Path(run.data.tags[FOLDER_TAG]), outcomes[run.data.tags[JOB_TAG]].varied) for run in finished)
@@ -246,7 +247,8 @@ def _pool_folds(
     missing = (
         f"{left_out} of {len(outcomes)} jobs are missing: the table is over the folds that all seeds were tested on"
     )
-    notes = [missing] if left_out else []
+    of_agent = next(figures for title, figures in table.results.items() if title.startswith(AGENT))
+    notes = [*([missing] if left_out else []), *few_wrists({"test ": of_agent})]
     print_result_table("all folds (test)", table, notes)
     keep_table(table, jobs, folder, store, parent["run_id"], notes)
     return True

@@ -23,6 +23,7 @@ from armscan.errors import ExportError, is_interruption
 from armscan.policies.model import ONNX_FILE, Arrays, arrays_of, model_sha256, write_model
 from armscan.tracking import TrackedRun
 from armscan.tracking.client import reason_in
+from armscan.training.domain import with_crops
 from armscan.training.episode_results import Env
 from armscan.utils.arrays import FloatArray
 from armscan.utils.run_files import CONFIG_FILE, POLICY_FOLDER
@@ -34,14 +35,32 @@ KEPT = "kept"
 SUM_TAG = "policy.sha256"
 # Largest allowed difference of the model from its network; and from the learner and ONNX, which sum in other orders.
 TOLERANCE, ROUNDING_TOLERANCE = 1e-6, 1e-5
+# Rules of the environment that its observations depend on, besides the observation itself.
+OF_OBSERVATION = ("projection", "stack", "memory", "stack_exclude", "stack_memory", "flat", "clustering", "reward")
 # First seed of the episodes that the observations come from, above those of evaluations; and number of observations.
 FIRST_SEED, N_OBSERVED = 6 * 10**6, 8
 
 
-def save_policy(agent: Learner, env: Env, tracked: TrackedRun, folder: Path, tell: Callable[[str], None]) -> None:
+def save_policy(
+    agent: Learner,
+    env: Env,
+    tracked: TrackedRun,
+    folder: Path,
+    tell: Callable[[str], None],
+    *,
+    slice_px: tuple[int, int],
+) -> None:
     """Store the policy of a trained agent as a model of its run, unless its configuration disables it.
 
     If the model cannot be stored, the run goes on: the reason is printed, and noted in a tag.
+
+    Args:
+        agent: The trained agent.
+        env: Environment of its observations.
+        tracked: Run of the agent.
+        folder: Folder of the run.
+        tell: Function that prints a sentence.
+        slice_px: Smallest slice of the run's volumes, which images are cropped to by default.
     """
     config = yaml.safe_load((folder / CONFIG_FILE).read_bytes())
     # Runs of earlier versions do not have the key.
@@ -49,7 +68,7 @@ def save_policy(agent: Learner, env: Env, tracked: TrackedRun, folder: Path, tel
         return
     model = folder / POLICY_FOLDER
     try:
-        make_model(agent, env, model, facts_of(config, env, tracked.run_id))
+        make_model(agent, env, model, facts_of(config, env, tracked.run_id, slice_px))
     except ExportError as error:
         # A model that the run made before it was interrupted.
         shutil.rmtree(model, ignore_errors=True)
@@ -91,7 +110,7 @@ def make_model(agent: Learner, env: Env, folder: Path, facts: Mapping[str, Any])
         raise ExportError(f"the model cannot be written or run: {reason_in(error)}") from error
 
 
-def facts_of(config: Mapping[str, Any], env: Env, run_id: str) -> dict[str, Any]:
+def facts_of(config: Mapping[str, Any], env: Env, run_id: str, slice_px: tuple[int, int]) -> dict[str, Any]:
     """Return the metadata of a model: its origin, its observations, and the meaning of its actions."""
     rules = config["env"]
     ways: dict[str, Any] = {"tx": "the volume's size across", "ty": "the volume's size along the arm"}
@@ -104,7 +123,8 @@ def facts_of(config: Mapping[str, Any], env: Env, run_id: str) -> dict[str, Any]
     return {
         "armscan": armscan.__version__,
         "run": run_id,
-        **{name: rules[name] for name in ("projection", "observation", "stack", "memory")},
+        **{name: rules[name] for name in OF_OBSERVATION if name in rules},
+        "observation": with_crops(rules["observation"], slice_px, slice_px),
         "action": {name: means[name] for name in env.get_wrapper_attr("action_names")},
     }
 

@@ -23,7 +23,7 @@ from armscan.tracking.client import reason_in
 from armscan.tracking.logged_model import VERSIONS_TAG, model_of
 from armscan.tracking.run import MODEL_FILE
 from armscan.tracking.store import store_errors
-from armscan.training import TEST
+from armscan.training import TEST, TrainingDomain
 from armscan.utils.run_files import POLICY_FOLDER
 
 MAX_NAME_CHARS = 256
@@ -57,7 +57,8 @@ def export_policy(tracking: str, run_id: str, folder: Path, *, trust: bool = Fal
     if not isinstance(evaluator.agent, Learner):
         raise InvalidValueError(f"run is {run_id!r}, but its agent does not learn and has no policy")
     env = evaluator.envs[TEST]
-    make_model(evaluator.agent, env, folder, facts_of(to_plain(source.config), env, source.run.run_id))
+    slice_px = (source.domain or TrainingDomain.of(env)).slice_px
+    make_model(evaluator.agent, env, folder, facts_of(to_plain(source.config), env, source.run.run_id, slice_px))
     return source.run
 
 

@@ -67,6 +67,14 @@ def test_and_next_fold(subjects: Sequence[str], folds: object, fold: object, see
     return groups[number], groups[(number + 1) % count]
 
 
+def check_folds(folds: object, test: object) -> None:
+    """Raise `InvalidValueError` if test volumes are given besides folds."""
+    if test is not None:
+        raise InvalidValueError(
+            f"data.folds is {folds!r}, which says what is tested on, but data.test is {test!r}: it must be null"
+        )
+
+
 def parts_by_subject(
     dataset: Dataset, wanted: Wanted, path: str, split_seed: int, folds: int | str | None, fold: int | None
 ) -> dict[str, str]:
@@ -84,13 +92,11 @@ def parts_by_subject(
         InvalidValueError: If the volumes cannot be split this way.
     """
     if folds is None and fold is not None:
-        raise InvalidValueError(f"data.fold is {fold!r}, but data.folds is None: it must say how many folds there are")
+        raise InvalidValueError(
+            f"data.fold is {fold!r}, but data.folds is null: give data.folds=leave_one_out, or their number"
+        )
     if folds is not None:
-        if wanted.get("test", PHANTOMS) is not None:
-            raise InvalidValueError(
-                f"data.folds is {folds!r}, which says what is tested on, but data.test is "
-                f"{wanted.get('test', PHANTOMS)!r}: it must be null"
-            )
+        check_folds(folds, wanted.get("test", PHANTOMS))
         test, after = test_and_next_fold(list(dict.fromkeys(dataset.subjects.values())), folds, fold, split_seed)
         of_next = {"validation": after} if "validation" in wanted and wanted["validation"] is None else {}
         wanted = {**wanted, "test": test, **of_next}

@@ -95,7 +95,7 @@ def check_ints(name: str, value: Any, length: int | None, meaning: str, **bounds
 
 def check_path(name: str, value: Any) -> Path:
     """Return `value` as a path if it is a string or a path."""
-    if not isinstance(value, str | Path) or "\0" in str(value):
+    if not isinstance(value, str | Path) or value == "" or "\0" in str(value):
         raise InvalidValueError(f"{name} is {value!r}, but it must be the path of a file or folder")
     return Path(value)
 

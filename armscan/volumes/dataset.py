@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING
 
 from armscan.errors import ManifestError, few, listed
 from armscan.utils.validation import check_choice, check_path
-from armscan.volumes.manifest import MANIFEST_NAMES, find_manifest, read_manifest, volume_entries, volume_files
+from armscan.volumes.manifest import (
+    MANIFEST_NAMES,
+    SHARED_KEYS,
+    find_manifest,
+    read_manifest,
+    volume_entries,
+    volume_files,
+)
 from armscan.volumes.read_cache import read_kept, resample_kept
 from armscan.volumes.reading import ReadingOptions
 from armscan.volumes.resampling import finest_spacing
@@ -20,8 +27,6 @@ if TYPE_CHECKING:
     from armscan.volumes.manifest_schema import Manifest, Splits
 
 SPLITS = ("train", "validation", "test")
-# Keys allowed both in an entry and at the top of a manifest.
-SHARED_KEYS = ("labels", "orientation", "axes", "overlap")
 
 
 @dataclass(frozen=True)
@@ -34,12 +39,14 @@ class Dataset:
         splits: Split of each volume (`train`, `validation` or `test`), by file name; None if the manifest has no
             splits.
         excluded: Reason why a volume of the folder was left out, by file name.
+        manifest: Manifest that the volumes were read with. Default: None, unknown.
     """
 
     volumes: dict[str, LabelVolume]
     reports: dict[str, VolumeReport]
     splits: dict[str, str] | None = None
     excluded: dict[str, str] = field(default_factory=dict)
+    manifest: Manifest | None = None
 
     @property
     def subjects(self) -> dict[str, str]:
@@ -96,6 +103,7 @@ def open_dataset(path: str | Path, *, require_manifest: bool = True) -> Dataset:
         reports={name: VolumeReport(volume, stored[name]) for name, volume in volumes.items()},
         splits=splits,
         excluded={name: str(entry.exclude) for name, entry in entries.items() if entry.exclude},
+        manifest=manifest,
     )
 
 

@@ -34,6 +34,8 @@ METAIMAGE_FIELDS = ("NDims", "DimSize", "ElementType", "ElementDataFile")
 NRRD_TYPES = {"char": 1, "uchar": 1, "int8": 1, "uint8": 1, "short": 2, "short int": 2, "ushort": 2, "int16": 2}
 NRRD_TYPES |= {"uint16": 2, "int": 4, "uint": 4, "int32": 4, "uint32": 4, "longlong": 8, "long long": 8}
 NRRD_TYPES |= {"long long int": 8, "ulonglong": 8, "int64": 8, "uint64": 8, "float": 4, "double": 8}
+# The last two: not stated.
+MILLIMETRES = ("mm", "millimeter", "millimeters", "millimetre", "millimetres", "?", "")
 NRRD_ENCODINGS = {"raw": None, "gzip": GZIP, "gz": GZIP}
 
 
@@ -44,6 +46,8 @@ def check_nrrd(path: Path, needed: Sequence[str] = ()) -> None:
         header, end, _ = _text_header(path).partition(b"\r\n\r\n")
     fields = {name.lower(): value for name, value in _fields(path, header, ":(?!=)").items()}
     _check_nrrd_spacing(path, fields)
+    for name in ("space units", "units"):
+        _check_units(path, name, re.findall(r'"([^"]*)"', fields.get(name, "")))
     for name in ("type", "dimension", "sizes", "encoding", *needed):
         if name not in fields:
             raise VolumeError(f"{path}: the file gives no {name}, but it must")
@@ -82,6 +86,10 @@ def check_metaimage(path: Path) -> None:
     if spacing is None:
         raise VolumeError(f"{path}: the file gives no spacing (ElementSpacing), but a volume needs one")
     check_spacing(path, [_number(word) for word in spacing.split()])
+    _check_units(path, "DistanceUnits", [fields.get("DistanceUnits", "")])
+    for name in ("Offset", "Position", "Origin"):
+        if not all(math.isfinite(_number(word)) for word in fields.get(name, "").split()):
+            raise VolumeError(f"{path}: {name} is {fields[name]!r}, but it must be finite numbers")
     sizes = [_whole(path, "DimSize", word) for word in fields["DimSize"].split()]
     kind = fields["ElementType"]
     if kind not in METAIMAGE_TYPES or fields["NDims"] != str(len(sizes)):
@@ -152,6 +160,12 @@ def _check_nrrd_spacing(path: Path, fields: dict[str, str]) -> None:
         check_spacing(path, [math.hypot(*map(_number, v.split(","))) if v else math.nan for v, _ in vectors])
     else:
         raise VolumeError(f"{path}: the file gives no spacing (spacings or space directions), but a volume needs one")
+
+
+def _check_units(path: Path, name: str, units: Sequence[str]) -> None:
+    """Raise `VolumeError` if a header states units of length other than mm, which SimpleITK ignores."""
+    if other := [unit for unit in units if unit.lower() not in MILLIMETRES]:
+        raise VolumeError(f"{path}: {name} is {other[0]!r}, but only volumes in mm are read")
 
 
 def _beside(path: Path, name: str) -> Path:

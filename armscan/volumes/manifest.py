@@ -30,6 +30,8 @@ MANIFEST_NAMES = ("manifest.yaml", "manifest.yml", "manifest.json", "optimal_act
 ENTRIES_ONLY = MANIFEST_NAMES[-1]
 NEW_MANIFEST = MANIFEST_NAMES[0]
 SUFFIXES = (".yaml", ".yml", ".json")
+# Keys allowed both in an entry and at the top of a manifest.
+SHARED_KEYS = ("labels", "orientation", "axes", "overlap")
 
 Document = dict[str, Any]
 
@@ -37,12 +39,17 @@ Document = dict[str, Any]
 def volume_files(folder: Path) -> dict[str, Path]:
     """Return the volumes of a folder by file name, in the order of their names."""
     try:
-        found = [file for file in sorted(folder.iterdir()) if file.name.endswith(tuple(CHECKS)) and file.is_file()]
+        named = [file for file in sorted(folder.iterdir()) if file.name.lower().endswith(tuple(CHECKS))]
+        found = [file for file in named if file.is_file()]
     except FileNotFoundError as error:
         raise VolumeError(f"{folder}: the folder of volumes does not exist") from error
     except (OSError, ValueError) as error:
         reason = (error.strerror if isinstance(error, OSError) else None) or error
         raise VolumeError(f"{folder}: the folder of volumes cannot be read ({reason})") from error
+    if absent := [file for file in named if file.is_symlink() and not file.exists()]:
+        raise VolumeError(f"{absent[0]}: is a link to {str(absent[0].readlink())!r}, but that file does not exist")
+    if capital := [file for file in found if not file.name.endswith(tuple(CHECKS))]:
+        raise VolumeError(f"{capital[0]}: ends in capitals, but the end of a volume's name must be {listed(CHECKS)}")
     if not found:
         raise VolumeError(f"{folder}: the folder holds no volume (files ending in {listed(CHECKS)})")
     return {file.name: file for file in found}
@@ -80,7 +87,12 @@ def volume_entries(manifest: Manifest, files: Mapping[str, Path], path: Path | N
     return {name: manifest.volumes[name] for name in files}
 
 
-def record_planes(folder: str | Path, planes: Mapping[str, tuple[ManipulatorAction, float]]) -> Path:
+def record_planes(
+    folder: str | Path,
+    planes: Mapping[str, tuple[ManipulatorAction, float]],
+    *,
+    read_with: Manifest | None = None,
+) -> Path:
     """Write optimal planes into the manifest of a folder, leaving everything else in it unchanged.
 
     A folder without a manifest gets `manifest.yaml`. The file is written atomically; comments in YAML are kept.
@@ -89,13 +101,15 @@ def record_planes(folder: str | Path, planes: Mapping[str, tuple[ManipulatorActi
         folder: Folder of the volumes.
         planes: Labelled plane and its reward, by file name; the plane is in the frame of the volume that `open_dataset`
             returns.
+        read_with: Manifest that these volumes were read with. Default: None, today's.
 
     Returns:
         The manifest.
 
     Raises:
         InvalidValueError: If `planes` is not such a mapping, or a score is not in [-1, 0].
-        ManifestError: If the manifest is damaged or cannot be written, or the folder holds no such volume.
+        ManifestError: If the manifest is damaged or cannot be written, if the folder holds no such volume, or if a
+            volume would now be read in another way.
         VolumeError: If the folder cannot be used.
     """
     folder = check_path("the folder of volumes", folder)
@@ -104,7 +118,7 @@ def record_planes(folder: str | Path, planes: Mapping[str, tuple[ManipulatorActi
     if unknown := [name for name in recorded if name not in files]:
         raise ManifestError(f"{folder}: a plane is given for {few(unknown)}, but the folder holds {few(files)}")
     with _locked(folder):
-        return _recorded(folder, recorded, files)
+        return _recorded(folder, recorded, files, read_with)
 
 
 def _locked(folder: Path) -> AcquireReturnProxy:
@@ -118,7 +132,9 @@ def _locked(folder: Path) -> AcquireReturnProxy:
         raise ManifestError(f"{path}: the manifest of {folder} cannot be locked ({error.strerror or error})") from error
 
 
-def _recorded(folder: Path, recorded: dict[str, dict[str, Any]], files: dict[str, Path]) -> Path:
+def _recorded(
+    folder: Path, recorded: dict[str, dict[str, Any]], files: dict[str, Path], read_with: Manifest | None
+) -> Path:
     """Write the keys of each volume's entry into the manifest; return its path."""
     from armscan.volumes.manifest_schema import check_manifest
 
@@ -128,7 +144,11 @@ def _recorded(folder: Path, recorded: dict[str, dict[str, Any]], files: dict[str
     if target.suffix not in SUFFIXES:
         raise ManifestError(f"{path}: is a link to {str(target)!r}, but a plane is written only to {listed(SUFFIXES)}")
     document = _load(path) if found else {}
-    check_manifest(document, path)
+    manifest = check_manifest(document, path)
+    if read_with is not None:
+        changed = [name for name in recorded if _reading_of(manifest, name) != _reading_of(read_with, name)]
+        if changed:
+            raise ManifestError(f"{path}: now reads {few(changed)} in another way than its plane was found in")
     entries = document.get("volumes")
     entries = {name: {} for name in files} if entries is None else entries
     entries = {**entries, **{name: {**entries.get(name, {}), **keys} for name, keys in recorded.items()}}
@@ -143,6 +163,12 @@ def _recorded(folder: Path, recorded: dict[str, dict[str, Any]], files: dict[str
     except Exception as error:
         raise ManifestError(f"{path}: the manifest cannot be written ({error})") from error
     return path
+
+
+def _reading_of(manifest: Manifest, name: str) -> tuple[Any, ...]:
+    """Return all that determines the frame of a volume."""
+    entry = volume_entries(manifest, dict.fromkeys(manifest.volumes or [name], Path()), None)[name]
+    return manifest.spacing, entry.crop_mm, *(manifest.setting(entry, key) for key in SHARED_KEYS)
 
 
 def _edited(text: str, recorded: dict[str, Document], wanted: Document) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import reprlib
+import unicodedata
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -22,10 +23,16 @@ def _printable(text: str) -> str:
     return text
 
 
+def _named(text: str) -> str:
+    if text != text.strip():
+        raise InvalidValueError(f"is {text!r}, but a subject must not begin or end with a blank")
+    return _printable(text)
+
+
 def _subjects(value: Any) -> tuple[str, ...]:
     if not isinstance(value, list | tuple) or not value or not all(isinstance(name, str) and name for name in value):
         raise InvalidValueError(f"a split is {value!r}, but it must be a list of at least one subject (strings)")
-    return tuple(value)
+    return tuple(map(_named, value))
 
 
 Rotation = Annotated[
@@ -36,6 +43,7 @@ Translation = Annotated[
 ]
 Score = Annotated[float, BeforeValidator(partial(check_float, "score", at_least=-1.0, at_most=0.0))]
 Text = Annotated[str, AfterValidator(_printable)]
+Subject = Annotated[str, AfterValidator(_named)]
 Axes = Annotated[str, BeforeValidator(check_axes)]
 Orientation = Annotated[str | None, BeforeValidator(check_orientation)]
 Labels = Annotated[LabelMap, BeforeValidator(LabelMap.from_mapping)]
@@ -63,7 +71,9 @@ class VolumeEntry(_Settings):
     rotation: Rotation | None = None
     translation: Translation | None = None
     score: Score | None = None
-    subject: Text | None = Field(default=None, min_length=1, description="a string that is not empty (quote numbers)")
+    subject: Subject | None = Field(
+        default=None, min_length=1, description="a string that is not empty (quote numbers)"
+    )
     exclude: bool | Annotated[Text, Field(min_length=1)] = Field(default=False, description="true, false or the reason")
     crop_mm: Annotated[Crop | None, BeforeValidator(check_crop)] = None
 
@@ -106,6 +116,15 @@ class Manifest(_Settings):
     spacing: Literal["own", "finest"] = Field(default="own", description="own or finest")
     splits: Splits | None = Field(default=None, description="lists of subjects under train, validation and test")
     volumes: dict[Text, VolumeEntry] | None = Field(default=None, description="entries by the names of the files")
+
+    @model_validator(mode="after")
+    def _has_no_lookalikes(self) -> Manifest:
+        names = [entry.subject for entry in (self.volumes or {}).values() if entry.subject is not None]
+        first: dict[str, str] = {}
+        for name in names:
+            if first.setdefault(unicodedata.normalize("NFC", name), name) != name:
+                raise InvalidValueError(f"has two spellings of the subject {name!r}, in different Unicode forms")
+        return self
 
     def setting(self, entry: VolumeEntry, key: str) -> Any:
         """Return a volume's value of a key: from its own entry, else from the top of the manifest."""

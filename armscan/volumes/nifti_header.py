@@ -26,7 +26,7 @@ LAYOUTS = {
         "type": ("h", 70),
         "steps": ("8f", 76),
         "begin": ("f", 108),
-        "sform_code": ("h", 254),
+        "codes": ("2h", 252),
         "place": ("18f", 256),
     },
     540: {
@@ -35,7 +35,7 @@ LAYOUTS = {
         "type": ("h", 12),
         "steps": ("8d", 104),
         "begin": ("q", 168),
-        "sform_code": ("i", 348),
+        "codes": ("2i", 344),
         "place": ("18d", 352),
     },
 }
@@ -45,6 +45,8 @@ LONGEST_HEADER = 544
 MAX_OFFSET = 1 << 24
 # Between the spacings of the header and of the sform, both of which many programs round.
 SPACING_TOLERANCE = 1e-3
+# Between qform and sform: the cosines of the axes, and the origin in voxels.
+PLACE_TOLERANCE = 0.01
 
 
 def check_nifti(path: Path) -> None:
@@ -79,8 +81,11 @@ def check_nifti(path: Path) -> None:
     check_spacing(path, fields["steps"][1:4][:n_dimensions])
     if not all(map(math.isfinite, fields["place"])):
         raise VolumeError(f"{path}: its place in the world (qform, sform) holds a NaN or an infinity")
-    if fields["sform_code"][0] > 0:
+    of_qform, of_sform = (code > 0 for code in fields["codes"])
+    if of_sform:
         _check_one_spacing(path, fields["steps"][1:4][:n_dimensions], fields["place"][6:])
+    if of_qform and of_sform and n_dimensions >= 3:
+        _check_one_place(path, fields["steps"][:4], fields["place"])
     voxel = np.dtype(order + TYPES[code])
     check_stored(
         path,
@@ -102,3 +107,24 @@ def _check_one_spacing(path: Path, steps: Sequence[float], sform: Sequence[float
         raise VolumeError(
             f"{path}: the spacing is ({stated}) by pixdim, but ({other}) by the sform: correct one of them"
         )
+
+
+def _check_one_place(path: Path, steps: Sequence[float], place: Sequence[float]) -> None:
+    """Raise `VolumeError` if qform and sform differ, of which SimpleITK takes one or the other.
+
+    Args:
+        path: The file.
+        steps: The sign of the qform's third axis, then the spacing.
+        place: Quaternion (b, c, d) and offset of the qform, then the rows of the sform.
+    """
+    # Deferred: scipy takes long to import, and few files have both.
+    from scipy.spatial.transform import Rotation
+
+    b, c, d, *offset = place[:6]
+    turned = Rotation.from_quat([b, c, d, math.sqrt(max(0.0, 1.0 - b * b - c * c - d * d))]).as_matrix()
+    turned[:, 2] *= -1.0 if steps[0] < 0.0 else 1.0
+    sform = np.reshape(place[6:], (3, 4))
+    cosines = sform[:, :3] / np.linalg.norm(sform[:, :3], axis=0)
+    moved = np.linalg.norm(sform[:, 3] - offset) / min(steps[1:])
+    if max(np.abs(cosines - turned).max(), moved) > PLACE_TOLERANCE:
+        raise VolumeError(f"{path}: its qform and its sform state different places in the world: correct one of them")

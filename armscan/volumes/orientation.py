@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -57,10 +57,13 @@ def check_crop(value: Any) -> Crop | None:
 
 
 def orientation_of(direction: FloatArray) -> str:
-    """Return the directions of the axes, such as 'LPS'; an oblique axis gets the letter of its largest component.
+    """Return the directions of the axes, such as 'LPS'; oblique axes get the letters of the nearest such orientation.
 
     Args:
         direction: Directions of the axes in the world (left, posterior, superior), as columns, shape (3, 3).
     """
-    largest = np.abs(direction).argmax(axis=0)
-    return "".join(WORLD_AXES[world][int(direction[world, axis] > 0)] for axis, world in enumerate(largest))
+    # Deferred: phantoms need no reader.
+    import SimpleITK
+
+    orientation_from: Callable[[list[float]], str] = SimpleITK.DICOMOrientImageFilter.GetOrientationFromDirectionCosines
+    return orientation_from(np.ravel(direction).tolist())

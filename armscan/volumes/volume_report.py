@@ -57,9 +57,16 @@ class VolumeReport:
 
 
 def missing_sources(labels: LabelMap | None, found: tuple[FoundSource, ...]) -> tuple[Source, ...]:
-    """Return the entries of the label map that the file lacks: values for a plain file, names for a segmentation."""
+    """Return the entries of the label map that the file lacks: values for a plain file, names for a segmentation.
+
+    A number in quotes is a name: it is reported for plain files, too, where a value was meant.
+    """
     if labels is None:
         return ()
     there = {each.source for each in found if each.n_voxels}
     by_name = any(isinstance(each.source, str) for each in found)
-    return tuple(source for source in labels.by_source if isinstance(source, str) == by_name and source not in there)
+    return tuple(
+        source
+        for source in labels.by_source
+        if source not in there and (isinstance(source, str) == by_name or (str(source).isdigit() and not by_name))
+    )

@@ -103,7 +103,7 @@ def test_policy_is_registered_with_the_figures_of_its_run(answer, armscan, tmp_p
     (child,) = [run for run in runs_in(tmp_path)[1] if run.info.run_id != run_id]
     assert answer("register", run_id, "--name=wrist plane")[0] == 0
     third = client.get_model_version("wrist plane", "3")
-    assert f"### by evaluation {child.info.run_id}, on own volumes, success_threshold=0.2\n" in third.description
+    assert f"### by evaluation {child.info.run_id}, on configured volumes, success_threshold=0.2\n" in third.description
     assert "### at the end of the run" in third.description
     assert len(third.description) <= MAX_CHARS
     assert {"test_volumes/success_rate", "training_volumes/success_rate"} <= third.tags.keys()

@@ -58,8 +58,8 @@ def print_plan(
     limits = [f"{settings.n_trials} trials"]
     limits += [f"{settings.timeout_hours:g} hours"] if settings.timeout_hours is not None else []
     limits += [f"{settings.max_env_steps:,} environment steps"] if settings.max_env_steps is not None else []
-    console.print(f"objective  {objectives}, over the seeds {', '.join(map(str, settings.seeds))}")
-    console.print(f"limits     {', '.join(limits)}; {settings.workers} workers")
+    console.print(f"objective  {objectives}, over {_seeds(settings.seeds)}")
+    console.print(f"limits     {', '.join(limits)}; {counted(settings.workers, 'worker')}")
     console.print(f"then       {_final(settings.final_eval)}")
     for each in initial:
         console.print(printable(f"begins     {each.message}"), markup=False, highlight=False)
@@ -93,8 +93,10 @@ def _print_cost(
         f"{state.env_steps:,} environment steps, {spent_mib:.0f} MiB"
     )
     console.print(
-        f"the rest   {n_left} trials and the final evaluation, about {least:.2f} to {most:.2f} hours and "
+        f"the rest   {counted(n_left, 'trial')} and the final evaluation, about {least:.2f} to {most:.2f} hours and "
         f"{spent_mib / len(state.finished) * n_left:.0f} MiB ({mean_s:.0f} s a trial so far)"
+        if most
+        else "the rest   nothing: the study has finished"
     )
 
 
@@ -165,6 +167,10 @@ def _final(settings: FinalEvalSettings) -> str:
         f"{counted(n_first, 'seed')} each{further} to select one, then that one and the control with "
         f"{settings.judge_seeds} more each on the test volumes"
     )
+
+
+def _seeds(seeds: Sequence[int]) -> str:
+    return f"{'the seed' if len(seeds) == 1 else 'the seeds'} {', '.join(map(str, seeds))}"
 
 
 def _values(parameter: Parameter) -> str:

@@ -179,8 +179,8 @@ def _check_same(settings: StudySettings, study: optuna.Study, wanted: Mapping[st
     differences = _differences(*fixed_of(study, wanted))
     if differences and not settings.allow_config_changes:
         raise StudyError(
-            f"{whose} was started with another configuration: {differences}; study.allow_config_changes=true accepts "
-            f"that{other}"
+            f"{whose} was started with another configuration: {differences}; accept that with "
+            f"study.allow_config_changes=true, or give study.name another value"
         )
     return bool(differences)
 

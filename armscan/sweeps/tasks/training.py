@@ -139,7 +139,7 @@ def _evaluate_on_test(
     # Deferred: most trials export no policy.
     from armscan.policies.build import save_policy
 
-    save_policy(agent, setup.test_env, tracked, folder, log)
+    save_policy(agent, setup.test_env, tracked, folder, log, slice_px=setup.smallest_slice_px)
     metrics = {f"{TEST_PREFIX}{name}": value for name, value in tested.metrics().items()}
     for volume, evaluation in tested.by_volume().items():
         metrics |= {f"{TEST_PREFIX}volume/{volume}/{name}": value for name, value in evaluation.metrics().items()}
