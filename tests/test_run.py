@@ -275,6 +275,11 @@ def test_run_on_labelmap_files(tmp_path, data_folder):
             "agent.step_mm is 0.01 and agent.step_deg is 0.01, which give ",
         ),
         (["obs=cluster,action_reward"], "'obs=cluster,action_reward' gives several values: add -m"),
+        (
+            ["data.path=wrists"],
+            "there is no key 'path' in data, but only n_training, n_validation, n_test, first_seed, cache_dir or "
+            "version: data.path needs data=nifti or data=mixed",
+        ),
         (["seed=-1"], "seed is -1, but it must be a whole number of at least 0"),
         (["stack=0"], "stack is 0, but it must be a whole number of at least 1"),
         (

@@ -353,6 +353,8 @@ def test_resume_refuses_a_run_of_something_else(answer, cut_off):
     client, run_id, _ = cut_off
     client.delete_tag(run_id, "folder")
     assert "it was not started by armscan run" in refused(answer, f"resume={run_id}")
+    client.set_tag(run_id, "study", "mine")
+    assert "belongs to the study mine: type its command again" in refused(answer, f"resume={run_id}")
 
 
 def test_resume_refuses_a_checkpoint_that_is_damaged_or_gone_and_leaves_the_run_as_it_is(answer, tmp_path):

@@ -232,12 +232,12 @@ def test_run_keeps_its_policy_or_says_why_not_and_finishes(regression, tmp_path,
     )
     folder = tmp_path / "run"
     folder.mkdir()
-    rules = {"projection": "zy", "observation": "cluster", "stack": 1, "memory": 0}
+    rules = {"projection": "zy", "observation": ["cluster", "slice"], "stack": 1, "memory": 0}
     bounds = {"rotation_bounds_deg": [90.0, 45.0], "translation_bounds_mm": [40.0, 300.0]}
     config = {"tracking": {"uri": "-"}, "env": rules | bounds}
     (folder / "config.yaml").write_text(yaml.safe_dump(config))
     with TrackedRun.start(store, experiment_id, name="n", config={}, tags={}, folder=folder) as tracked:
-        save_policy(Otherwise(learner, shift), env, tracked, folder, print)
+        save_policy(Otherwise(learner, shift), env, tracked, folder, print, slice_px=(90, 80))
     run = store.get_run(tracked.run_id)
     assert run.info.status == "FINISHED"
     assert run.data.tags["policy"].startswith(tag)
@@ -251,13 +251,14 @@ def test_run_keeps_its_policy_or_says_why_not_and_finishes(regression, tmp_path,
         assert {"policy/MLmodel", "policy/policy.onnx", "policy/artifacts"} <= kept
         said = yaml.safe_load((folder / "policy" / "MLmodel").read_text())["metadata"]
         assert said["run"] == tracked.run_id
+        assert said["observation"][1]["crop"] == [90, 80]
         assert said["action"] == {"rz": "times 90.0 degrees", "ty": "(a + 1) / 2 times 300.0, in mm"}
 
 
 def test_run_keeps_no_policy_where_its_configuration_says_so(regression, tmp_path):
     (tmp_path / "config.yaml").write_text("tracking: {policy: false}")
     # The tracked run is not used.
-    save_policy(*regression, None, tmp_path, print)
+    save_policy(*regression, None, tmp_path, print, slice_px=(90, 80))
     assert [path.name for path in tmp_path.iterdir()] == ["config.yaml"]
 
 

@@ -111,6 +111,6 @@ def test_truth_values_choices_and_paths():
     for value in ("b", np.array(["a"])):
         with pytest.raises(InvalidValueError, match=r"c is .*, but it must be"):
             check_choice("c", value, ("a", "z"))
-    for value in (0, "a\0b", None):
+    for value in (0, "", "a\0b", None):
         with pytest.raises(InvalidValueError, match="the path of a file or folder"):
             check_path("p", value)

@@ -28,7 +28,7 @@ NRRD = (
 )
 
 
-def nifti(n, begin=352.0, magic=b"n+1\0", place=1.0):
+def nifti(n, begin=352.0, magic=b"n+1\0", place=1.0, qform=None):
     """Return the header of a NIfTI file of n x n x n bytes."""
     header = bytearray(352)
     struct.pack_into("<i", header, 0, 348)
@@ -37,7 +37,8 @@ def nifti(n, begin=352.0, magic=b"n+1\0", place=1.0):
     struct.pack_into("<8f", header, 76, *[1.0] * 8)
     struct.pack_into("<f", header, 108, begin)
     struct.pack_into("<12f", header, 280, *[place, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0])
-    struct.pack_into("<2h", header, 252, 0, 1)
+    struct.pack_into("<6f", header, 256, *qform or [0.0] * 6)
+    struct.pack_into("<2h", header, 252, qform is not None, 1)
     header[344:348] = magic
     return bytes(header)
 
@@ -122,6 +123,8 @@ VOXELS = np.ascontiguousarray(make_tiny_volume().labels[:10, :10, :10].T).tobyte
         (nifti(10, magic=bytes(4)), "of a pair of files (.hdr and .img), which is not read"),
         (nifti(10, place=float("nan")), "its place in the world (qform, sform) holds a NaN"),
         (nifti(10, place=float("inf")), "its place in the world (qform, sform) holds a NaN"),
+        (nifti(10, qform=(0, 0, 0.1, 0, 0, 0)), "its qform and its sform state different places in the world"),
+        (nifti(10, qform=(0, 0, 0, 0.02, 0, 0)), "its qform and its sform state different places in the world"),
         (nifti(10, place=1.01), "the spacing is (1, 1, 1) by pixdim, but (1.01, 1, 1) by the sform"),
         (nifti(10, place=-0.99), "the spacing is (1, 1, 1) by pixdim, but (0.99, 1, 1) by the sform"),
     ],

@@ -139,11 +139,11 @@ def test_report_tells_what_the_file_held_and_what_became_of_it(write_labelmap, t
     stored[0, 0, :5] = 999
     write_labelmap("a.nrrd", labels=stored, spacing=(0.5, 0.5, 2.0, 1.0))
     (tmp_path / "manifest.yaml").write_text(
-        "labels: {bones: [10, 11], tendons: [20], artery: [30, Ulnar artery], others: background}"
+        'labels: {bones: [10, 11], tendons: [20], artery: [30, "31", Ulnar artery], others: background}'
     )
     report = open_dataset(tmp_path).reports["a.nrrd"]
     assert {each.source: (each.label, each.n_voxels) for each in report.stored.found}[999] == (0, 5)
-    assert report.stored.missing == (11,)
+    assert report.stored.missing == (11, "31")
     assert report.n_voxels["bones"] == (tiny_volume.labels == 1).sum()
     assert report.tissue_mm3["bones"] == pytest.approx(0.5 * (tiny_volume.labels == 1).sum())
     assert report.n_voxels["nerve"] == 0

@@ -9,7 +9,7 @@ from dataclasses import fields
 import pytest
 import yaml
 
-from armscan.errors import InvalidValueError, ManifestError
+from armscan.errors import InvalidValueError, ManifestError, VolumeError
 from armscan.volumes import LabelMap, ManipulatorAction, open_dataset, record_planes
 from tests.support import REPOSITORY
 from tests.volumes.test_dataset import PLANE
@@ -43,6 +43,29 @@ def test_manifest_is_read_in_either_language(folder, name):
 
 def test_manifest_without_entries_takes_every_volume(folder):
     assert list(open_dataset(written(folder, "axes: xyz")).volumes) == ["a.nii.gz", "b.nrrd"]
+
+
+@pytest.mark.parametrize(
+    ("subjects", "message"),
+    [
+        (("S1 ", "S1"), "is 'S1 ', but a subject must not begin or end with a blank"),
+        (("Mu\u0308ller", "M\u00fcller"), "has two spellings of the subject 'M\u00fcller'"),
+    ],
+)
+def test_manifest_refuses_subjects_that_look_alike(folder, subjects, message):
+    entries = {name: {"subject": subject} for name, subject in zip(("a.nii.gz", "b.nrrd"), subjects, strict=True)}
+    with pytest.raises(ManifestError, match=message):
+        open_dataset(written(folder, {"volumes": entries}))
+
+
+def test_volumes_that_would_be_left_out_silently_are_refused(folder):
+    (folder / "c.nii.gz").symlink_to("annex/c")
+    with pytest.raises(VolumeError, match=r"c\.nii\.gz: is a link to 'annex/c', but that file does not exist"):
+        open_dataset(written(folder, ""))
+    (folder / "c.nii.gz").unlink()
+    (folder / "a.nii.gz").rename(folder / "A.NII.GZ")
+    with pytest.raises(VolumeError, match=r"A\.NII\.GZ: ends in capitals"):
+        open_dataset(folder)
 
 
 def test_manifest_may_be_missing_where_that_is_said(folder):
@@ -300,6 +323,17 @@ def test_link_of_a_stranger_makes_and_changes_no_file_of_the_user(folder, tmp_pa
         record_planes(folder, {"a.nii.gz": (ACTION, 0.0)})
     assert str(home / target) in str(caught.value)
     assert [(file.name, file.read_text()) for file in home.iterdir()] == [("profile", "# empty so far\n")]
+
+
+@pytest.mark.parametrize("edit", ["crop_mm: {y: [2, 8]}", "axes: yxz"])
+def test_plane_of_a_volume_that_is_now_read_otherwise_is_not_written(folder, edit):
+    read_with = open_dataset(written(folder, "volumes: {a.nii.gz: {}, b.nrrd: {}}")).manifest
+    record_planes(folder, {"b.nrrd": (ACTION, 0.0)}, read_with=read_with)
+    text = written(folder, f"volumes: {{a.nii.gz: {{{edit}}}, b.nrrd: {{subject: S1}}}}") / "manifest.yaml"
+    with pytest.raises(ManifestError, match=r"now reads a\.nii\.gz in another way than its plane was found in"):
+        record_planes(folder, {"a.nii.gz": (ACTION, 0.0)}, read_with=read_with)
+    assert "rotation" not in text.read_text()
+    record_planes(folder, {"b.nrrd": (ACTION, 0.0)}, read_with=read_with)
 
 
 def test_lock_of_a_folder_may_be_held_by_every_user_of_the_cache(folder, tmp_path, monkeypatch):

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from armscan.errors import VolumeError
 from armscan.volumes import open_dataset, read_volume
-from armscan.volumes.orientation import orientation_of
+from armscan.volumes.orientation import check_orientation, orientation_of
 from armscan.volumes.plane import rotation_matrix
 
 ORIENTATIONS = [
@@ -79,6 +80,13 @@ def test_read_volume_leaves_every_voxel_where_it_is_in_the_world(
 def test_read_volume_turns_the_axes_as_asked(tmp_path, orientation):
     volume = read_volume(written(tmp_path, np.eye(3), (1.0, 2.0, 3.0)), orientation=orientation)
     assert orientation_of(volume.direction) == orientation
+
+
+@settings(max_examples=50)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_orientation_of_oblique_axes_names_each_world_axis_once(seed):
+    orientation = orientation_of(Rotation.random(rng=np.random.default_rng(seed)).as_matrix())
+    assert check_orientation(orientation) == orientation
 
 
 def test_read_volume_names_the_axes_after_turning_them(tmp_path):

@@ -1,0 +1,18 @@
+"""Users' mistakes in one line."""
+
+import pytest
+from hydra.errors import InstantiationException
+
+from armscan.config.error_messages import one_line_message
+from armscan.errors import InvalidValueError
+
+
+def test_message_of_ours_stays_as_it_is():
+    assert one_line_message(InvalidValueError("agent.lr is 0")) == "agent.lr is 0"
+
+
+@pytest.mark.parametrize(("section", "key"), [("agent", "agent.lr"), ("agent.sac", "agent.sac.lr")])
+def test_message_from_a_nested_section_names_its_keys(section, key):
+    error = InstantiationException(f"Error in call to target\nfull_key: {section}")
+    error.__cause__ = InvalidValueError("agent.lr is 0")
+    assert one_line_message(error) == f"{key} is 0"
