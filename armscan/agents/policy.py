@@ -14,7 +14,7 @@ from armscan.envs.history import observation_of, parts_of
 from armscan.envs.rules import Observed
 
 # A batch of observations as tensors: one of shape (n, k), or the parts by their names, each of shape (n, ...).
-Batch = torch.Tensor | dict[str, torch.Tensor]
+ObservationTensors = torch.Tensor | dict[str, torch.Tensor]
 
 
 class Policy(nn.Module):
@@ -43,7 +43,7 @@ class Policy(nn.Module):
         if self.differs is None and not compute.is_float32_on_cpu:
             self.differs = f"the agent has computed with {compute.precision} on {compute.torch_device}"
 
-    def forward(self, observations: Batch) -> torch.Tensor:
+    def forward(self, observations: ObservationTensors) -> torch.Tensor:
         """Return the actions for a batch of observations, shape (n, n_action), within [-1, 1]."""
         (mean, _), _ = self.actor(observations)
         return self._bounded(mean)
@@ -54,9 +54,9 @@ def clip_action(mean: torch.Tensor) -> torch.Tensor:
     return mean.clamp(-1.0, 1.0)
 
 
-def batch_of(observations: Sequence[Observed]) -> Batch:
+def batch_of(observations: Sequence[Observed]) -> ObservationTensors:
     """Return one or more single observations as one batch of tensors."""
     parts = [parts_of(observation) for observation in observations]
     stacked = {name: np.stack([each[name] for each in parts]) for name in parts[0]}
     tensors: Any = {name: torch.from_numpy(array) for name, array in stacked.items()}
-    return cast(Batch, observation_of(tensors))
+    return cast(ObservationTensors, observation_of(tensors))

@@ -92,11 +92,14 @@ class PPO(PolicyParameters):
         from tianshou.trainer import OnPolicyTrainer, OnPolicyTrainerParams
         from torch.distributions import Independent, Normal
 
+        from armscan.agents.base_learner import prepare_torch
         from armscan.agents.image_replay import replay_for
         from armscan.agents.policy import clip_action
-        from armscan.agents.tianshou_learner import TianshouLearner, training_envs, training_parameters
+        from armscan.agents.tianshou_envs import TianshouVectorEnv
+        from armscan.agents.tianshou_learner import TianshouLearner, training_parameters
 
-        envs, device = training_envs(setup, self.num_envs), setup.compute.torch_device
+        envs, device = TianshouVectorEnv(setup.make_envs(self.num_envs)), setup.compute.torch_device
+        prepare_torch(setup.seed)
         actor = network.actor(
             setup.observation_space,
             len(setup.action_names),

@@ -14,7 +14,7 @@ from armscan.agents.base_learner import SupervisedLearner, diverged, prepare_tor
 from armscan.agents.hyperparameters import Parameters
 from armscan.agents.inference import Inference
 from armscan.agents.networks import Network
-from armscan.agents.policy import Batch, clip_action
+from armscan.agents.policy import ObservationTensors, clip_action
 from armscan.agents.protocols import AgentSetup
 from armscan.agents.supervised_buffer import SupervisedBuffer
 from armscan.envs.actions import ActionBounds
@@ -113,7 +113,7 @@ class RegressionLearner(SupervisedLearner):
         self._optimiser.step()
         return loss.detach()
 
-    def _predicted(self, observations: Observed | Batch) -> torch.Tensor:
+    def _predicted(self, observations: Observed | ObservationTensors) -> torch.Tensor:
         """Return the predicted optimal actions of a batch, shape (n, n_action), not yet clipped."""
         (mean, _), _ = self._network(observations)
         return torch.as_tensor(mean)

@@ -105,12 +105,15 @@ class SAC(PolicyParameters):
         from tianshou.algorithm.optim import AdamOptimizerFactory
         from tianshou.trainer import OffPolicyTrainerParams
 
+        from armscan.agents.base_learner import prepare_torch
         from armscan.agents.compiled_sac import CompiledSAC
         from armscan.agents.image_replay import replay_for
         from armscan.agents.off_policy_trainer import EvenUpdatesTrainer
-        from armscan.agents.tianshou_learner import TianshouLearner, training_envs, training_parameters
+        from armscan.agents.tianshou_envs import TianshouVectorEnv
+        from armscan.agents.tianshou_learner import TianshouLearner, training_parameters
 
-        envs, device = training_envs(setup, self.num_envs), setup.compute.torch_device
+        envs, device = TianshouVectorEnv(setup.make_envs(self.num_envs)), setup.compute.torch_device
+        prepare_torch(setup.seed)
         space, n_action = setup.observation_space, len(setup.action_names)
         actor = network.actor(space, n_action, log_std=None)
         critics = [network.critic(space, n_action).to(device) for _ in range(2)]

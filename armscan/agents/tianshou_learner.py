@@ -16,7 +16,7 @@ from tianshou.algorithm.algorithm_base import Policy as TianshouPolicy
 from tianshou.data import collector
 from tianshou.trainer import OffPolicyTrainer, OnPolicyTrainer
 
-from armscan.agents.base_learner import BaseLearner, diverged, is_finite, load_into, prepare_torch
+from armscan.agents.base_learner import BaseLearner, diverged, is_finite, load_into
 from armscan.agents.compiled_sac import CompiledSAC
 from armscan.agents.compute import Compute
 from armscan.agents.epoch_metrics import EpochMetrics
@@ -213,13 +213,6 @@ class TianshouLearner(BaseLearner):
         self._replay.load_state(state["replay"])
         self._collector.collect_step = state["n_env_steps"]
         self._n_epochs = state["n_epochs"]
-
-
-def training_envs(setup: AgentSetup, num_envs: int) -> TianshouVectorEnv:
-    """Return the training environments, and seed the weights of the networks that are made next."""
-    envs = TianshouVectorEnv(setup.make_envs(num_envs))
-    prepare_torch(setup.seed)
-    return envs
 
 
 def training_parameters(

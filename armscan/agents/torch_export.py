@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from armscan.agents.policy import Batch, Policy
+from armscan.agents.policy import ObservationTensors, Policy
 from armscan.errors import ExportError, is_interruption, reason_of
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 OBSERVATION, NEXT_ACTION = "observation", "next_action"
 
 
-def export_program(policy: Policy, batch: Batch) -> ExportedProgram:
+def export_program(policy: Policy, batch: ObservationTensors) -> ExportedProgram:
     """Return a policy as a torch program, for batches of every size.
 
     Args:
@@ -43,7 +43,7 @@ def save_program(program: ExportedProgram, file: Path) -> None:
         torch.export.save(program, file)
 
 
-def save_onnx(program: ExportedProgram, batch: Batch, file: Path) -> None:
+def save_onnx(program: ExportedProgram, batch: ObservationTensors, file: Path) -> None:
     """Write a program as ONNX, with the parts of an observation as its inputs, for batches of every size.
 
     Args:

@@ -37,7 +37,7 @@ class Clusters:
         return len(self.sizes)
 
     @property
-    def n_points(self) -> int:
+    def n_pixels(self) -> int:
         """Number of pixels that belong to a cluster."""
         return int(self.sizes.sum())
 
@@ -88,7 +88,7 @@ class TissueClusters:
     @property
     def landmarks(self) -> Landmarks:
         """The summary that rewards are computed from, shape (3, 4)."""
-        return np.array([[len(tissue), tissue.n_points, *tissue.mean_centre] for tissue in self.each()])
+        return np.array([[len(tissue), tissue.n_pixels, *tissue.mean_centre] for tissue in self.each()])
 
 
 def tissue_dice(slice_xz: NDArray[np.uint8], reference_xz: NDArray[np.uint8]) -> dict[str, float]:

@@ -18,7 +18,7 @@ from armscan.envs.panels import BACKGROUND, INK, LINE_INK, OPTIMUM_INK, PLANE_IN
 from armscan.envs.rendering import HEIGHT, WIDTH, Box, History, ReferencePlane, draw_plane, view_of
 from armscan.envs.rules import Volumes, named_volumes
 from armscan.envs.scene import SceneSampler
-from armscan.envs.window import check_display, opened
+from armscan.envs.window import check_display, picture_figure
 from armscan.errors import OptimalPlaneError
 from armscan.utils.validation import check_choice
 from armscan.volumes import LabelVolume, ManipulatorAction, open_dataset
@@ -59,7 +59,9 @@ class Explorer:
         self.rewards: list[float] = []
         self._tissues = tissues
         self._is_setting = False
-        self.figure, self._image = opened("armscan", np.full((HEIGHT, WIDTH, 3), BACKGROUND, np.uint8), HEIGHT_BELOW)
+        self.figure, self._image = picture_figure(
+            "armscan", np.full((HEIGHT, WIDTH, 3), BACKGROUND, np.uint8), HEIGHT_BELOW
+        )
         # Nothing else holds a reference to the widgets, and without one they no longer respond.
         setattr(self.figure, "explorer", self)  # noqa: B010
         self.sliders = {component: self._slider(row, component) for row, component in enumerate(COMPONENTS)}

@@ -22,7 +22,7 @@ from armscan.utils.validation import MAX_SEED
 
 if TYPE_CHECKING:
     from armscan.evaluation.runner import PreparedAgent
-    from armscan.evaluation.volumes import Volumes
+    from armscan.evaluation.volumes import VolumesByName
 
 N_EPISODES, N_VIDEO_EPISODES = 200, 3
 ON_PLANE_KEY = "evaluation.on_plane"
@@ -122,7 +122,7 @@ def evaluate(
     # Deferred: command-line errors are reported before these are loaded.
     from armscan import evaluation
     from armscan.config.defaults import default_tracking
-    from armscan.evaluation.runner import apply
+    from armscan.evaluation.runner import prepare_agent
 
     if agent is None:
         source = evaluation.agent_of_run(tracking, run[0], changes, trust=trust)
@@ -132,9 +132,9 @@ def evaluate(
         source = evaluation.agent_of_overrides(overrides, folder, changes)
     n_episodes = episodes or (N_VIDEO_EPISODES if video else N_EPISODES)
     if video:
-        _record(apply(source, data, phantoms, render_mode="rgb_array"), n_episodes, seed, out)
+        _record(prepare_agent(source, data, phantoms, render_mode="rgb_array"), n_episodes, seed, out)
     else:
-        prepared = apply(source, data, phantoms, check=lambda groups: _check_episodes(n_episodes, groups))
+        prepared = prepare_agent(source, data, phantoms, check=lambda groups: _check_episodes(n_episodes, groups))
         experiment = {} if tracking_experiment is None else {"experiment": tracking_experiment}
         _evaluate(prepared, default_tracking() | {"uri": tracking} | experiment, n_episodes, seed, changes, out)
 
@@ -212,7 +212,7 @@ def _check_words(run: Sequence[str], agent: str | None, data: str | None, change
             raise click.UsageError(f"{given[key]} and {key} are both given, but they are one value: give one of them")
 
 
-def _check_episodes(n_episodes: int, groups: Mapping[str, Volumes]) -> None:
+def _check_episodes(n_episodes: int, groups: Mapping[str, VolumesByName]) -> None:
     for label, volumes in groups.items():
         if n_episodes < len(volumes):
             least = f"at least {len(volumes)}: one for each of the {label}"

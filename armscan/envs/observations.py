@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple, Protocol
@@ -29,9 +29,10 @@ class SliceGeometry(NamedTuple):
     pixel_mm: tuple[float, float]
 
 
-def smallest_shape(geometries: Sequence[SliceGeometry]) -> tuple[int, int]:
-    """Return the largest shape, (across, depth), that fits into the slices of every geometry."""
-    return min(g.shape[0] for g in geometries), min(g.shape[1] for g in geometries)
+def smallest_shape(shapes: Collection[tuple[int, int]]) -> tuple[int, int]:
+    """Return the largest shape, (across, depth), that fits into slices of all these shapes."""
+    across, depth = zip(*shapes, strict=True)
+    return min(across), min(depth)
 
 
 @dataclass(eq=False)

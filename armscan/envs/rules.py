@@ -88,7 +88,7 @@ class Rules:
         self._geometries = {
             volume.name: SliceGeometry(volume.slice_shape, volume.pixel_mm) for volume in self.volumes.values()
         }
-        self._smallest_shape = smallest_shape(list(self._geometries.values()))
+        self._smallest_shape = smallest_shape([each.shape for each in self._geometries.values()])
         self._observation = with_action_reward(observation, getattr(self.reward, "targets", PUBLISHED_TARGETS))
         boxes = self._observation.spaces(list(self._geometries.values()), len(self.action_names))
         self._shapes = {name: box.shape for name, box in boxes.items()}

@@ -37,7 +37,7 @@ class _FramedSlice:
 
     def _observed_shape(self, geometries: Sequence[SliceGeometry]) -> Shape:
         """Return the shape of the observed image; raise `InvalidValueError` if the crop exceeds the smallest slice."""
-        smallest = smallest_shape(geometries)
+        smallest = smallest_shape([each.shape for each in geometries])
         if self._crop is not None and (self._crop[0] > smallest[0] or self._crop[1] > smallest[1]):
             raise InvalidValueError(
                 f"crop is {self._crop}, but it must be at most {smallest}, the smallest slice (across, depth) of the "

@@ -40,7 +40,7 @@ class Window:
     def show(self, picture: NDArray[np.uint8]) -> None:
         """Show a picture, shape (height, width, 3), once the last one has been shown for long enough."""
         if self._figure is None or self._image is None:
-            self._figure, self._image = opened(self.title, picture)
+            self._figure, self._image = picture_figure(self.title, picture)
             self._figure.canvas.mpl_connect("close_event", self._was_closed)
             self._figure.show()
             self._is_open = True
@@ -67,7 +67,7 @@ class Window:
         self._is_open = False
 
 
-def opened(title: str, picture: NDArray[np.uint8], height_below: int = 0) -> tuple[Figure, AxesImage]:
+def picture_figure(title: str, picture: NDArray[np.uint8], height_below: int = 0) -> tuple[Figure, AxesImage]:
     """Make a figure, not shown yet, that shows a picture pixel for pixel.
 
     Args:

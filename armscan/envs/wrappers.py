@@ -53,16 +53,16 @@ class _HistoryWrapper(gym.Wrapper[Any, FloatArray, Any, FloatArray], RecordConst
         observation, info = self.env.reset(seed=seed, options=options)
         parts = _batch_of_one(observation)
         self.history.refill(parts, info, ONLY)
-        return self._with_memory(parts), info
+        return self._with_history(parts), info
 
     def step(self, action: FloatArray) -> tuple[Observed, float, bool, bool, dict[str, Any]]:
         """Take a step."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         parts = _batch_of_one(observation)
         self.history.push(parts, info, ONLY)
-        return self._with_memory(parts), float(reward), terminated, truncated, info
+        return self._with_history(parts), float(reward), terminated, truncated, info
 
-    def _with_memory(self, parts: dict[str, Any]) -> Observed:
+    def _with_history(self, parts: dict[str, Any]) -> Observed:
         return observation_of({name: part[0] for name, part in self.history.added_to(parts, ONLY).items()})
 
 

@@ -2,7 +2,7 @@
 
 from armscan.evaluation.agent_source import TrainedAgent, agent_of_overrides, agent_of_run
 from armscan.evaluation.report import EvaluationReport, report_tables
-from armscan.evaluation.runner import prepare
+from armscan.evaluation.runner import prepare_on_volumes
 from armscan.evaluation.volumes import own_split
 
 __all__ = [
@@ -11,6 +11,6 @@ __all__ = [
     "agent_of_overrides",
     "agent_of_run",
     "own_split",
-    "prepare",
+    "prepare_on_volumes",
     "report_tables",
 ]

@@ -16,7 +16,7 @@ from armscan.stats.bootstrap import LEVEL, N_RESAMPLES, Estimate
 from armscan.tracking.sanitize import name_of
 from armscan.training import Evaluation, MetricEstimates, ResultTable
 from armscan.training.baselines import RANDOM
-from armscan.training.episode_results import group_of
+from armscan.training.episode_results import metric_prefix
 from armscan.training.headline import ABOVE_RANDOM, beside_random, headline
 from armscan.training.metric_display import interval_text
 from armscan.training.metrics import LEAST_SURE, NOT_STARTED_SOLVED, SUREST
@@ -60,7 +60,7 @@ class EvaluationReport:
     @cached_property
     def by_split(self) -> dict[str, MetricEstimates]:
         """Return the metrics by the name of the volumes, and the pooled ones under `all volumes`."""
-        played, randoms = self._played(self.evaluations), self._played(self.baselines.get(RANDOM, {}))
+        played, randoms = self._with_total(self.evaluations), self._with_total(self.baselines.get(RANDOM, {}))
         return {
             label: beside_random(MetricEstimates.of(each), [each], randoms.get(label)) for label, each in played.items()
         }
@@ -69,7 +69,7 @@ class EvaluationReport:
     def baselines_by_split(self) -> dict[str, dict[str, MetricEstimates]]:
         """Return the metrics of the baselines, by their names, then as `by_split`."""
         return {
-            name: {label: MetricEstimates.of(each) for label, each in self._played(evaluations).items()}
+            name: {label: MetricEstimates.of(each) for label, each in self._with_total(evaluations).items()}
             for name, evaluations in self.baselines.items()
         }
 
@@ -82,7 +82,7 @@ class EvaluationReport:
             tables[label] = ResultTable({AGENT: figures, **baselines}, headline=headline({AGENT: figures}, random))
         return tables
 
-    def _played(self, evaluations: Mapping[str, Evaluation]) -> dict[str, Evaluation]:
+    def _with_total(self, evaluations: Mapping[str, Evaluation]) -> dict[str, Evaluation]:
         """Return evaluations by the name of their volumes, and the pooled one if there is a total."""
         if not self.has_total or len(evaluations) < 2:
             return dict(evaluations)
@@ -127,14 +127,14 @@ class EvaluationReport:
 
     def metrics(self) -> dict[str, dict[str, float]]:
         """Return the metrics by their origin: `test_volumes`, `volume/NAME`, `BASELINE/test_volumes`."""
-        groups = {group_of(label): metrics.metrics() for label, metrics in self.by_split.items()}
+        groups = {metric_prefix(label): metrics.metrics() for label, metrics in self.by_split.items()}
         for volumes in self.by_volume.values():
             for name, metrics in volumes.items():
                 groups[name_of(f"volume/{name}")] = metrics.metrics()
         shown = {label: [column.metric for column in table.quantities] for label, table in self.tables().items()}
         for name, by_split in self.baselines_by_split.items():
             for label, names in shown.items():
-                groups[group_of(f"{name}/{label}")] = by_split[label].shown_metrics(names)
+                groups[metric_prefix(f"{name}/{label}")] = by_split[label].shown_metrics(names)
         return groups
 
 

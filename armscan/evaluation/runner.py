@@ -14,7 +14,7 @@ from armscan.errors import CheckpointError, InvalidValueError, OptimalPlaneError
 from armscan.evaluation.agent_source import TrainedAgent
 from armscan.evaluation.volumes import (
     TrainingVolumes,
-    Volumes,
+    VolumesByName,
     known_volumes,
     own_split,
     phantom_version,
@@ -78,12 +78,12 @@ class PreparedAgent:
         return evaluations, baselines
 
 
-def apply(
+def prepare_agent(
     source: TrainedAgent,
     data: str | None,
     n_phantoms: int,
     *,
-    check: Callable[[Mapping[str, Volumes]], None] = lambda _: None,
+    check: Callable[[Mapping[str, VolumesByName]], None] = lambda _: None,
     render_mode: str | None = None,
 ) -> PreparedAgent:
     """Prepare an agent for volumes, and print the differences from its training.
@@ -104,7 +104,7 @@ def apply(
     own = cache(partial(own_split, source, parts))
     groups = volume_groups(data, n_phantoms, own, phantom_version(source))
     check(groups)
-    prepared = prepare(source, groups, own, render_mode=render_mode)
+    prepared = prepare_on_volumes(source, groups, own, render_mode=render_mode)
     notes = list(prepared.notes)
     known = known_volumes(source, groups) if data and source.run else []
     notes += known
@@ -115,8 +115,12 @@ def apply(
     return replace(prepared, notes=tuple(notes), data=data, is_new=data is not None and not known)
 
 
-def prepare(
-    source: TrainedAgent, groups: Mapping[str, Volumes], own: Callable[[], Split], *, render_mode: str | None = None
+def prepare_on_volumes(
+    source: TrainedAgent,
+    groups: Mapping[str, VolumesByName],
+    own: Callable[[], Split],
+    *,
+    render_mode: str | None = None,
 ) -> PreparedAgent:
     """Make the agent and its environments on the volumes that it is evaluated on.
 
@@ -153,7 +157,7 @@ def prepare(
     return PreparedAgent(source, agent, envs, tuple(notes))
 
 
-def _env(env_factory: EnvFactory, volumes: Volumes, clustering: object, render_mode: str | None) -> Env:
+def _env(env_factory: EnvFactory, volumes: VolumesByName, clustering: object, render_mode: str | None) -> Env:
     try:
         return env_factory.undeformed().make_env(volumes, render_mode=render_mode)
     except OptimalPlaneError as error:

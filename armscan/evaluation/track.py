@@ -28,7 +28,7 @@ REPORT_KEYS = {"of", "name", "splits", "volumes", "episodes", "tracked_as"}
 
 
 def evaluate_and_track(
-    applied: PreparedAgent,
+    prepared: PreparedAgent,
     store: Mapping[str, Any],
     *,
     n_episodes: int,
@@ -39,7 +39,7 @@ def evaluate_and_track(
     """Evaluate an agent, write the report as JSON, and track it.
 
     Args:
-        applied: Agent on its volumes.
+        prepared: Agent on its volumes.
         store: Config section `tracking`; used for an agent without a run.
         n_episodes: Number of episodes for each group of volumes.
         seed: Seed of the first episode; the others follow from it.
@@ -52,20 +52,20 @@ def evaluate_and_track(
     Raises:
         ArmscanError: If the report cannot be written or tracked.
     """
-    source = applied.source
+    source = prepared.source
     _check_out(out)
     client, experiment_id = _store_of(source, store)
     upload_pending(client)
     limits = on_plane_of(source.config)
-    of, data = source.run.run_id if source.run else source.name, data_name(applied.data)
+    of, data = source.run.run_id if source.run else source.name, data_name(prepared.data)
     facts = {
         "of": of,
         "name": source.name,
-        "data": applied.data or data,
+        "data": prepared.data or data,
         "episodes_a_split": n_episodes,
         "seed": seed,
         "changes": dict(changes),
-        "notes": list(applied.notes),
+        "notes": list(prepared.notes),
     }
     with TrackedRun.start(
         client,
@@ -76,11 +76,11 @@ def evaluate_and_track(
         folder=FOLDER,
         parent_id=source.run.run_id if source.run else None,
     ) as tracked:
-        evaluations, baselines = applied.evaluate(n_episodes, seed, tell=partial(print, flush=True))
+        evaluations, baselines = prepared.evaluate(n_episodes, seed, tell=partial(print, flush=True))
         # An agent's own training and test volumes are never merged into one total.
         report = EvaluationReport(
             evaluations,
-            has_total=applied.is_new,
+            has_total=prepared.is_new,
             facts={**facts, "tracked_as": tracked.run_id},
             baselines=baselines,
         )
@@ -92,7 +92,7 @@ def evaluate_and_track(
         text = json.dumps(report.to_dict(), indent=1, allow_nan=False)
         atomic_write(file, text, follow_link=True)
         shown = own.with_suffix(".html")
-        contents = _html(tracked.name, report, applied.notes)
+        contents = _html(tracked.name, report, prepared.notes)
         atomic_write(shown, contents)
         tracked.log_files(file, shown)
     return report, file

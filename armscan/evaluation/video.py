@@ -17,11 +17,11 @@ FOLDER = Path("videos")
 SUFFIXES = (".gif", ".mp4")
 
 
-def record_video(applied: PreparedAgent, *, n_episodes: int, seed: int, out: Path | None = None) -> list[Path]:
+def record_video(prepared: PreparedAgent, *, n_episodes: int, seed: int, out: Path | None = None) -> list[Path]:
     """Record the episodes that an evaluation with the same seed plays, and print how each went.
 
     Args:
-        applied: Agent on its volumes; of its own volumes, only the test volumes are shown.
+        prepared: Agent on its volumes; of its own volumes, only the test volumes are shown.
         n_episodes: Number of episodes for each group of volumes.
         seed: Seed of the first episode; the others follow from it.
         out: Folder of the files. Default: `videos`.
@@ -31,28 +31,28 @@ def record_video(applied: PreparedAgent, *, n_episodes: int, seed: int, out: Pat
     """
     folder = out or FOLDER
     check_out(folder / "video", folder, "video")
-    source = applied.source
+    source = prepared.source
     which = [source.run.run_id[:ID_CHARS]] if source.run else []
-    name = file_name(source.name, data_name(applied.data), *which, f"seed{seed}")
+    name = file_name(source.name, data_name(prepared.data), *which, f"seed{seed}")
     files = [folder / f"{name}{suffix}" for suffix in SUFFIXES]
     with tempfile.TemporaryDirectory() as made_in:
         made = [Path(made_in) / f"video{suffix}" for suffix in SUFFIXES]
-        _record(applied, n_episodes, seed, *made)
+        _record(prepared, n_episodes, seed, *made)
         for recorded, file in zip(made, files, strict=True):
             with recorded.open("rb") as contents:
                 atomic_write(file, partial(shutil.copyfileobj, contents), follow_link=True)
     return files
 
 
-def _record(applied: PreparedAgent, n_episodes: int, seed: int, gif: Path, mp4: Path) -> None:
-    envs = applied.envs
-    shown = envs if applied.data else {TEST: envs[TEST]}
+def _record(prepared: PreparedAgent, n_episodes: int, seed: int, gif: Path, mp4: Path) -> None:
+    envs = prepared.envs
+    shown = envs if prepared.data else {TEST: envs[TEST]}
     with VideoRecorder(gif, mp4) as video:
         for label, env in shown.items():
             names = list(env.get_wrapper_attr("volumes"))
             for number in range(n_episodes):
                 volume, title = names[number % len(names)], f"seed {seed + number}"
                 episode = video.capture(
-                    applied.agent, env, volume_name=volume, seed=FIRST_SEED + seed + number, title=title
+                    prepared.agent, env, volume_name=volume, seed=FIRST_SEED + seed + number, title=title
                 )
                 print(f"{label}: {volume}, {title}: {outcome(episode)}", flush=True)

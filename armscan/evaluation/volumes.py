@@ -23,7 +23,7 @@ from armscan.volumes.phantom import VERSIONS
 PHANTOMS_FIRST_SEED = 3_000_000
 # Names of files have at most 255 bytes.
 MAX_PART_BYTES = 50
-Volumes = dict[str, LabelVolume]
+VolumesByName = dict[str, LabelVolume]
 
 
 def own_split(source: TrainedAgent, parts: Sequence[str] = PARTS) -> Split:
@@ -61,7 +61,9 @@ def phantom_version(source: TrainedAgent) -> int:
     return next((version for version in VERSIONS if version == named), 1)
 
 
-def volume_groups(data: str | None, n_phantoms: int, own: Callable[[], Split], version: int = 1) -> dict[str, Volumes]:
+def volume_groups(
+    data: str | None, n_phantoms: int, own: Callable[[], Split], version: int = 1
+) -> dict[str, VolumesByName]:
     """Return the volumes to evaluate on, by group name.
 
     Args:
@@ -106,7 +108,7 @@ def check_out(file: Path, out: Path | None, what: str) -> None:
         raise InvalidValueError(f"--out is {named!r}, but no {what} can be written there: {error.strerror}") from error
 
 
-def known_volumes(source: TrainedAgent, groups: Mapping[str, Volumes]) -> list[str]:
+def known_volumes(source: TrainedAgent, groups: Mapping[str, VolumesByName]) -> list[str]:
     """Return a sentence for each way in which an agent's run used these volumes, or others with their names.
 
     Args:
@@ -141,7 +143,7 @@ class TrainingVolumes(Mapping[str, LabelVolume]):
         self._load = load
 
     @cached_property
-    def _volumes(self) -> Volumes:
+    def _volumes(self) -> VolumesByName:
         try:
             return self._load().training
         # Hydra wraps exceptions raised by constructors.

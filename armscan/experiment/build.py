@@ -126,7 +126,7 @@ def build_experiment(config: DictConfig, split: Split | None = None) -> Experime
     check_config(config)
     budget = build_section(config, "training", Budget)
     split = split or build_section(config, "data", Split)
-    smallest = smallest_slice([*split.training.values(), *split.validation.values(), *split.test.values()])
+    smallest = smallest_slice(volume for part in split.parts.values() for volume in part.values())
     env_factory = make_env_factory(apply_crop(config, smallest, smallest), split.training)
     agent = make_agent(
         config,

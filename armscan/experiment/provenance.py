@@ -18,10 +18,10 @@ from armscan.experiment.build import Experiment
 from armscan.experiment.job import Invocation
 from armscan.tracking import (
     TrackedRun,
+    code_state,
     environment_file,
     environment_tags,
     open_store,
-    source,
     tags_of,
     upload_pending,
 )
@@ -112,7 +112,7 @@ def _remove_earlier(folder: Path) -> None:
 
 def provenance_files(config: dict[str, Any], setup: Experiment) -> dict[str, bytes]:
     """Return the files that describe a run's origin, by their names: configuration, volumes, code."""
-    diff = source().diff
+    diff = code_state().diff
     return {
         CONFIG_FILE: yaml.safe_dump(config, sort_keys=False).encode(),
         VOLUMES_FILE: json.dumps(setup.fingerprints, indent=1).encode(),

@@ -24,7 +24,7 @@ from armscan.training import (
     evaluate_baselines,
 )
 from armscan.training.baselines import RANDOM
-from armscan.training.episode_results import TEST_GROUP, group_of
+from armscan.training.episode_results import TEST_METRICS, metric_prefix
 from armscan.training.headline import ABOVE_RANDOM, beside_random, headline
 from armscan.training.metric_display import LEADING
 from armscan.utils.files import atomic_write
@@ -45,7 +45,7 @@ TITLES = {
 EVALUATED = "/success_rate"
 # Of the metrics of a single volume in an evaluation.
 VOLUME_PREFIX = "volume/"
-NAMES = {group_of(name): name for name in (TEST, TRAINING)} | {"validation": LAST_VALIDATION}
+NAMES = {metric_prefix(name): name for name in (TEST, TRAINING)} | {"validation": LAST_VALIDATION}
 # With fewer wrists intervals are clearly too narrow: docs/metrics.md.
 MIN_WRISTS = 8
 WHAT_HELPS = (
@@ -122,7 +122,7 @@ class RunResult:
     def model_metrics(self) -> dict[str, list[str]]:
         """Return the names of the metrics that describe the run's checkpoint, by split."""
         names = [*(limits.metric for limits in self.evaluations[TEST].on_plane), *LEADING]
-        groups = {"test": TEST_GROUP, "validation": "validation"}
+        groups = {"test": TEST_METRICS, "validation": "validation"}
         return {part: [f"{group}/{name}" for name in names] for part, group in groups.items()}
 
     def notes(self) -> list[str]:

@@ -14,7 +14,7 @@ from armscan.config.defaults import FOLD
 from armscan.reports.html import page
 from armscan.training import TEST, Evaluation, MetricEstimates, ResultTable
 from armscan.training.baselines import RANDOM
-from armscan.training.episode_results import TEST_GROUP
+from armscan.training.episode_results import TEST_METRICS
 from armscan.training.headline import beside_random, headline
 from armscan.utils.files import atomic_write
 from armscan.utils.run_files import BASELINES_FILE, EVALUATION_FILE, RESULTS_PAGE
@@ -105,7 +105,7 @@ def keep_table(
     text = page("all folds (test)", f"{said}{table.html()}<h2>Jobs</h2>{jobs.html()}")
     atomic_write(file, text)
     time_ms = now_ms()
-    groups = {title: TEST_GROUP if title == AGENT else title.removesuffix(ALL_FOLDS) for title in table.results}
+    groups = {title: TEST_METRICS if title == AGENT else title.removesuffix(ALL_FOLDS) for title in table.results}
     metrics = [
         Metric(f"{group}/{name}", value, time_ms, 0)
         for title, group in groups.items()

@@ -82,7 +82,7 @@ class Multirun(Callback):
         folder = Path(config.hydra.sweep.dir)
         print(f"preparing a multirun in {folder}", flush=True)
         # Deferred: it loads MLflow, after the first line is printed.
-        from armscan.tracking import begin_outbox, open_store, source
+        from armscan.tracking import begin_outbox, code_state, open_store
 
         if not isinstance(config.tracking, DictConfig):
             raise InvalidValueError(f"tracking is {config.tracking!r}, but it must be a section, such as its default")
@@ -98,7 +98,12 @@ class Multirun(Callback):
             *hydra_words,
             f"{TRACKING_URI}={QuotedString(tracking['uri'], Quote.single).with_quotes()}",
         ]
-        tags = {**source().tags, "overrides": command, "working_folder": str(Path.cwd()), GRID_TAG: json.dumps(again)}
+        tags = {
+            **code_state().tags,
+            "overrides": command,
+            "working_folder": str(Path.cwd()),
+            GRID_TAG: json.dumps(again),
+        }
         run = client.create_run(experiment_id, name=f"multirun {command}"[:250], tags=tags)
         parent = {"run_id": run.info.run_id, "tracking": tracking, "overrides": overrides, "common": _common(overrides)}
         parent |= {"repeats": Multirun.repeats, "is_trusted": Multirun.is_trusted}

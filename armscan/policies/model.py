@@ -14,7 +14,7 @@ import yaml
 from mlflow.models import infer_signature
 from numpy.typing import NDArray
 
-from armscan.agents.policy import Batch, Policy
+from armscan.agents.policy import ObservationTensors, Policy
 from armscan.agents.torch_export import export_program, save_onnx, save_program
 from armscan.tracking.run import MODEL_FILE
 from armscan.utils.files import sha256
@@ -41,7 +41,7 @@ REQUIREMENTS = ("mlflow", "numpy", "torch")
 Arrays = NDArray[Any] | dict[str, NDArray[Any]]
 
 
-def write_model(folder: Path, policy: Policy, batch: Batch, facts: Mapping[str, Any]) -> None:
+def write_model(folder: Path, policy: Policy, batch: ObservationTensors, facts: Mapping[str, Any]) -> None:
     """Write a policy as a model, with an ONNX file beside it.
 
     Args:
@@ -94,7 +94,7 @@ def model_sha256(folder: Path) -> str:
     return sha256("".join(f"{sha256((folder / name).read_bytes())}  {name}\n" for name in files).encode())
 
 
-def arrays_of(batch: Batch) -> Arrays:
+def arrays_of(batch: ObservationTensors) -> Arrays:
     """Return a batch of tensors as the model takes it."""
     if isinstance(batch, torch.Tensor):
         return batch.numpy()

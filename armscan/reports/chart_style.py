@@ -1,4 +1,4 @@
-"""The look of all charts."""
+"""The style of all charts."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ MAX_MARKERS = 60
 
 
 @functools.cache
-def look() -> Template:
+def template() -> Template:
     """Return the template of all charts."""
-    template = Template(io.templates["plotly_white"])
-    template.layout.update(
+    plain = Template(io.templates["plotly_white"])
+    plain.layout.update(
         font={"family": "system-ui, sans-serif", "size": 13, "color": "#222"},
         colorway=qualitative.D3,
         hoverlabel={"align": "left"},
@@ -28,9 +28,9 @@ def look() -> Template:
         xaxis={"automargin": True},
         yaxis={"automargin": True},
     )
-    return template
+    return plain
 
 
-def mode(n_points: int) -> str:
+def line_mode(n_points: int) -> str:
     """Return Plotly's mode for a curve of `n_points`: with markers, unless they would hide it."""
     return "lines+markers" if n_points <= MAX_MARKERS else "lines"

@@ -12,7 +12,7 @@ from plotly.colors import hex_to_rgb, qualitative
 from plotly.graph_objects import Figure
 from plotly.subplots import make_subplots
 
-from armscan.reports.chart_style import GREY, RATE_AXIS, mode
+from armscan.reports.chart_style import GREY, RATE_AXIS, line_mode
 from armscan.reports.curves import AXES, NOTHING, Curve
 from armscan.reports.groups import Group
 from armscan.stats.aggregation import MIN_SEEDS
@@ -197,7 +197,7 @@ def _traces(of_axes: Sequence[Curve], colour: str, *, is_detailed: bool) -> Iter
             yield Trace(SEEDS, thin | said, [_points(*each.lines.get(label, ((), ()))) for each in of_axes])
     if curve.n_seeds:
         thick = {
-            "mode": mode(len(curve.places)),
+            "mode": line_mode(len(curve.places)),
             "marker": {"size": 5},
             "line": {"color": colour, "width": 2.5},
             "hovertemplate": "%{text}",

@@ -57,7 +57,7 @@ def curve_of(group: Group, figure: str, axis: str) -> Curve | None:
     places = _places(known)
     of_seeds: dict[str, list[FloatArray]] = defaultdict(list)
     for training, line in known:
-        of_seeds[training.seed or training.run_id].append(np.interp(places, *line))
+        of_seeds[training.seed_key].append(np.interp(places, *line))
     # The folds of a seed count as one seed.
     values, *ends = band_over_seeds(np.array([np.mean(each, axis=0) for each in of_seeds.values()]))
     band = Band(values, *np.clip(ends, *bounds_of(figure)))

@@ -40,7 +40,7 @@ class Group:
     @property
     def n_seeds(self) -> int:
         """Number of seeds; all folds of a seed count once."""
-        return len({training.seed or training.run_id for training in self.trainings})
+        return len({training.seed_key for training in self.trainings})
 
     @property
     def n_folds(self) -> int:
@@ -99,7 +99,7 @@ def of_common_folds(trainings: Iterable[TrackedTraining]) -> list[TrackedTrainin
     """Return the trainings of the folds that all seeds have: otherwise wrists of the other folds would count less."""
     trainings, of_seeds = list(trainings), defaultdict(set)
     for training in trainings:
-        of_seeds[training.seed or training.run_id].add(training.fold)
+        of_seeds[training.seed_key].add(training.fold)
     common = set.intersection(*of_seeds.values()) if of_seeds else set()
     return [training for training in trainings if training.fold in common]
 

@@ -187,9 +187,9 @@ def chart(figure: graph_objects.Figure, *, is_wide: bool = False) -> str:
         figure: Chart to embed.
         is_wide: Whether a phone scrolls the chart, because it cannot be narrow. Default: False.
     """
-    from armscan.reports.chart_style import look
+    from armscan.reports.chart_style import template
 
-    figure.update_layout(title=None, template=look())
+    figure.update_layout(title=None, template=template())
     drawn = figure.to_html(full_html=False, include_plotlyjs=False, config=CHART_CONFIG)
     return f'<div class="chart{" wide" if is_wide else ""}">{drawn}</div>'
 

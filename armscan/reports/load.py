@@ -99,6 +99,11 @@ class TrackedTraining:
         return self.params.get("seed")
 
     @property
+    def seed_key(self) -> str:
+        """Its seed; its run ID if its configuration has none, so that it counts as a seed of its own."""
+        return self.seed or self.run_id
+
+    @property
     def fold(self) -> str | None:
         """Fold of a cross-validation that it was tested on; None if it is of none."""
         return self.params.get(FOLD) if self.params.get(FOLDS, UNSET) != UNSET else None

@@ -69,13 +69,12 @@ def _below(store: TrackingStore, run: Run, depth: int = 0) -> Iterator[Run]:
     """Yield a run if it is a training, else those of its jobs, trials and seeds."""
     if AGENT_TAG in run.data.tags:
         yield run
-    if AGENT_TAG in run.data.tags or depth > MAX_DEPTH:
-        return
-    children = store.children(run.info.experiment_id, run.info.run_id)
-    # Jobs of a grid start in parallel: sorted by number, they are in the order of the grid's own table.
-    numbers = {child.info.run_id: child.data.tags.get(JOB_TAG, "") for child in children}
-    for child in sorted(children, key=lambda each: (len(numbers[each.info.run_id]), numbers[each.info.run_id])):
-        yield from _below(store, child, depth + 1)
+    elif depth <= MAX_DEPTH:
+        children = store.children(run.info.experiment_id, run.info.run_id)
+        # Jobs of a grid start in parallel: sorted by number, they are in the order of the grid's own table.
+        numbers = {child.info.run_id: child.data.tags.get(JOB_TAG, "") for child in children}
+        for child in sorted(children, key=lambda each: (len(numbers[each.info.run_id]), numbers[each.info.run_id])):
+            yield from _below(store, child, depth + 1)
 
 
 def _in_experiment(store: TrackingStore, name: str) -> list[Run]:

@@ -45,7 +45,7 @@ def evaluations_by_seed(group: Group) -> dict[str, Evaluation]:
     played: dict[str, list[Evaluation]] = defaultdict(list)
     for training in group.tested:
         assert training.evaluation is not None
-        played[training.seed or training.run_id].append(training.evaluation)
+        played[training.seed_key].append(training.evaluation)
     return {seed: Evaluation.pooled(evaluations) for seed, evaluations in played.items()}
 
 
@@ -127,7 +127,7 @@ def _volumes(group: Group) -> Mapping[str, str | None] | None:
         assert training.evaluation is not None
         known = (training.volumes or {}).get("test", {})
         prints = {name: known.get(name) for name in training.evaluation.by_volume()}
-        of_seeds[training.seed or training.run_id] |= prints
+        of_seeds[training.seed_key] |= prints
     first, *others = of_seeds.values() or [None]
     return first if all(_are_same(first, each) for each in others) else None
 

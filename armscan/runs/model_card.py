@@ -16,7 +16,7 @@ from armscan.tracking import FoundRun
 from armscan.tracking.sanitize import name_of
 from armscan.tracking.tags import EVALUATED_TAG
 from armscan.training import ON_PLANE, TEST, Evaluation, ResultTable
-from armscan.training.episode_results import group_of
+from armscan.training.episode_results import metric_prefix
 from armscan.training.metric_display import LEADING
 from armscan.utils.run_files import BASELINES_FILE, EVALUATION_FILE
 
@@ -151,7 +151,7 @@ def _damaged(run_id: str, file: str) -> TrackingError:
 
 def _tags(report: EvaluationReport) -> dict[str, str]:
     return {
-        name_of(f"{group_of(label)}/{name}"): f"{estimate.value:.4g}"
+        name_of(f"{metric_prefix(label)}/{name}"): f"{estimate.value:.4g}"
         for label, figures in report.by_split.items()
         for name in (*(limits.metric for limits in figures.on_plane), *TAGGED)
         if (estimate := figures.estimates[name]).value == estimate.value

@@ -14,7 +14,7 @@ from mlflow.models import Model
 from armscan.agents import Learner
 from armscan.config.defaults import to_plain
 from armscan.errors import ExportError, InvalidValueError
-from armscan.evaluation import agent_of_run, own_split, prepare
+from armscan.evaluation import agent_of_run, own_split, prepare_on_volumes
 from armscan.policies.build import SUM_TAG, facts_of, make_model, onnx_answers, tags_of_kept
 from armscan.policies.model import ONNX_FILE, model_sha256
 from armscan.runs.model_card import Card
@@ -53,7 +53,7 @@ def export_policy(tracking: str, run_id: str, folder: Path, *, trust: bool = Fal
     if "deterministic_eval" in source.config.agent:
         source.config.agent.deterministic_eval = True
     own = cache(partial(own_split, source, ("training", "test")))
-    evaluator = prepare(source, {TEST: own().test}, own)
+    evaluator = prepare_on_volumes(source, {TEST: own().test}, own)
     if not isinstance(evaluator.agent, Learner):
         raise InvalidValueError(f"run is {run_id!r}, but its agent does not learn and has no policy")
     env = evaluator.envs[TEST]

@@ -19,8 +19,9 @@ from armscan.experiment.job import Invocation, remove_if_untracked
 from armscan.experiment.provenance import CHOICES_IN_TAGS, start_tracking
 from armscan.experiment.runner import run_tracked
 from armscan.runs.compare import Comparison, compare_runs
-from armscan.tracking import FoundRun, environment_tags, load_agent_run, source
-from armscan.tracking.environment import COMMIT, CONSTRAINTS_SUM, DIFF_SUM, DIRTY, REPORTED_PACKAGES, environment
+from armscan.tracking import FoundRun, code_state, environment_tags, load_agent_run
+from armscan.tracking.environment import CONSTRAINTS_SUM, REPORTED_PACKAGES, environment
+from armscan.tracking.git import COMMIT, DIFF_SUM, DIRTY
 from armscan.tracking.sync import ENDED
 from armscan.tracking.tags import CHOICE
 from armscan.training import check_unchanged
@@ -82,7 +83,7 @@ def _environment(text: str, run: FoundRun) -> Mapping[str, Any]:
 
 def differences(original: Original) -> list[str]:
     """Return the differences from the original environment of a run, in a line each: code, packages, machine."""
-    tags, now = original.run.tags, {**source().tags, **environment_tags()}
+    tags, now = original.run.tags, {**code_state().tags, **environment_tags()}
     lines = [
         f"{what} was {tags.get(tag, 'not kept')}, and is {now.get(tag, 'not kept')}"
         for tag, what in ((COMMIT, "the git commit"), (CONSTRAINTS_SUM, "the sum of constraints.txt"))

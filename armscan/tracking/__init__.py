@@ -1,7 +1,8 @@
 """MLflow tracking: the store, its runs, and their plots."""
 
 from armscan.tracking.client import TrackingStore
-from armscan.tracking.environment import environment_file, environment_tags, source
+from armscan.tracking.environment import environment_file, environment_tags
+from armscan.tracking.git import code_state
 from armscan.tracking.lookup import (
     FoundRun,
     check_run_id,
@@ -28,6 +29,7 @@ __all__ = [
     "check_run_id",
     "check_settings",
     "check_version",
+    "code_state",
     "draw_learning_curve",
     "environment_file",
     "environment_tags",
@@ -39,7 +41,6 @@ __all__ = [
     "open_existing_store",
     "open_store",
     "run_of_study",
-    "source",
     "sync",
     "tags_of",
     "take_over",

@@ -1,19 +1,13 @@
-"""Environment of a run: the state of the code, Python, the machine, and the version of every package."""
+"""Environment of a run: Python, the machine, and the version of every package."""
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import json
-import os
 import platform
 import re
-import shutil
-import subprocess
 import sys
-import tempfile
 from collections.abc import Mapping
-from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -39,12 +33,6 @@ PACKAGE_FOLDERS = {"site-packages", "dist-packages"}
 PYTHON, CONSTRAINTS_SUM = "version.python", "constraints.sha256"
 UNKNOWN = "unknown"
 HEADER = re.compile(r"^(Name|Version): *(\S+)", re.MULTILINE)
-# Largest untracked file that the diff includes: source code, but no volume beside it.
-MAX_UNTRACKED_BYTES = 2**20
-COMMIT, DIRTY, DIFF_SUM = "git.commit", "git.dirty", "git.diff.sha256"
-# Override the user's settings of `git diff`, which could break `git apply`.
-PLAIN = ("--no-ext-diff", "--no-textconv", "--no-color", "--binary", "--src-prefix=a/", "--dst-prefix=b/")
-TIMEOUT_S = 30.0
 
 
 @functools.cache
@@ -84,78 +72,3 @@ def environment_tags() -> dict[str, str]:
         # Only a clone has this file, a wheel does not.
         CONSTRAINTS_SUM: sha256(constraints.read_bytes()) if constraints.is_file() else UNKNOWN,
     }
-
-
-@dataclass(frozen=True)
-class Source:
-    """State of the source code when it was loaded.
-
-    Args:
-        commit: Git commit; `unknown` if the code is not in a git repository.
-        diff: Uncommitted changes in the format of `git apply`, empty if there are none; None if they are not known.
-    """
-
-    commit: str
-    diff: bytes | None
-
-    @property
-    def tags(self) -> dict[str, str]:
-        """Tags that identify the code."""
-        known = {} if self.commit == UNKNOWN else {"mlflow.source.git.commit": self.commit}
-        dirty = UNKNOWN if self.diff is None else str(bool(self.diff)).lower()
-        summed = {DIFF_SUM: sha256(self.diff)} if self.diff else {}
-        return {COMMIT: self.commit, **known, DIRTY: dirty, **summed}
-
-
-@functools.cache
-def source() -> Source:
-    """Return the state of the code, read once per process, because loaded code does not change."""
-    return source_in(Path(__file__).parent)
-
-
-def source_in(folder: Path) -> Source:
-    """Return the state of the working tree that contains a folder."""
-    commit = UNKNOWN
-    with contextlib.suppress(OSError, subprocess.SubprocessError):
-        # A package installed inside another project's tree is not part of that project's code.
-        if _git(folder, "ls-files", "--", "."):
-            commit = _git(folder, "rev-parse", "HEAD").decode().strip()
-            tree = os.fsdecode(_git(folder, "rev-parse", "--show-toplevel")).rstrip("\n")
-            return Source(commit, _diff(Path(tree)))
-    return Source(commit, None)
-
-
-def _diff(tree: Path) -> bytes:
-    """Return the diff of a working tree from its commit, including new files; change nothing."""
-    new = [name for name in _git(tree, "ls-files", "--others", "--exclude-standard", "-z").split(b"\0") if name]
-    left_out = {name: why for name in new if (why := _why_left_out(tree, name))}
-    told = "".join(f"# not kept, {why}: {os.fsdecode(name)!r}\n" for name, why in left_out.items()).encode()
-    kept = [name for name in new if name not in left_out]
-    with tempfile.TemporaryDirectory() as beside:
-        # A diff shows new files only if the index lists them: list them in a copy of the index.
-        index = Path(beside, "index")
-        shutil.copyfile(tree / os.fsdecode(_git(tree, "rev-parse", "--git-path", "index")).rstrip("\n"), index)
-        if kept:
-            words = ("add", "--intent-to-add", "--force", "--pathspec-from-file=-", "--pathspec-file-nul")
-            _git(tree, "--literal-pathspecs", *words, index=index, given=b"\0".join(kept))
-        return told + _git(tree, "diff", *PLAIN, "HEAD", index=index)
-
-
-def _why_left_out(tree: Path, name: bytes) -> str | None:
-    """Return why the diff cannot include a new file; None if it can."""
-    if name.endswith(b"/"):
-        return "because it is a repository of its own"
-    return "for its size" if (tree / os.fsdecode(name)).lstat().st_size > MAX_UNTRACKED_BYTES else None
-
-
-def _git(folder: Path, *arguments: str, index: Path | None = None, given: bytes = b"") -> bytes:
-    """Run git in a folder, and return its output."""
-    # Inside a git hook, these variables point to the hook's repository.
-    variables = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
-    if index is not None:
-        variables["GIT_INDEX_FILE"] = str(index)
-    words = ["git", *arguments]
-    answer = subprocess.run(
-        words, cwd=folder, input=given, capture_output=True, timeout=TIMEOUT_S, check=True, env=variables
-    )
-    return answer.stdout

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, Self
 from armscan.config.command_hints import armscan_command
 from armscan.errors import TrackingError, is_interruption
 from armscan.tracking.client import TrackingStore
-from armscan.tracking.environment import DIFF_SUM, environment_tags, source
+from armscan.tracking.environment import environment_tags
+from armscan.tracking.git import DIFF_SUM, code_state
 from armscan.tracking.notes import forget
 from armscan.tracking.outbox import Address, Outbox, file_of, now_ms
 from armscan.tracking.sanitize import params_of, tags_of
@@ -86,7 +87,7 @@ class TrackedRun:
             parent_id: ID of its parent run. Default: None, no parent.
         """
         parent = {PARENT_TAG: parent_id} if parent_id else {}
-        run = store.create_run(experiment_id, name=name, tags={**source().tags, **tags, **parent})
+        run = store.create_run(experiment_id, name=name, tags={**code_state().tags, **tags, **parent})
         tracked = cls.open_existing(store, run.info.run_id, name=name, folder=folder)
         tracked._log_config(config)
         return tracked
@@ -116,7 +117,7 @@ class TrackedRun:
         if not (resumed := run.data.tags.get("resumed", "0")).isdecimal():
             raise TrackingError(f"run {run_id}: its tag resumed is {resumed[:50]!r}, but it must be a whole number")
         n_resumed = int(resumed[:MAX_DIGITS]) + 1
-        now = {**source().tags, **environment_tags()}
+        now = {**code_state().tags, **environment_tags()}
         changed = {f"resumed.{key}": value for key, value in now.items() if run.data.tags.get(key) != value}
         had_outbox = file_of(folder, run_id).exists()
         outbox = Outbox.begin(folder, Address(run_id, store.uri))
@@ -132,7 +133,7 @@ class TrackedRun:
         tracked.resume()
         tracked.set_tags(dict(tags) | changed | {"resumed": str(n_resumed)})
         tracked._log_config(config, known=params)
-        if (diff := source().diff) and f"resumed.{DIFF_SUM}" in changed:
+        if (diff := code_state().diff) and f"resumed.{DIFF_SUM}" in changed:
             file = folder / RESUMED_DIFF_FILE.format(n_resumed)
             atomic_write(file, diff)
             tracked.log_files(file)

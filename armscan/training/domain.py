@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from typing import Any, Self
 
@@ -12,6 +12,7 @@ from gymnasium import spaces
 from pydantic import TypeAdapter, ValidationError
 
 from armscan.envs.observation_registry import NAMED_OBSERVATIONS
+from armscan.envs.observations import smallest_shape
 from armscan.errors import InvalidValueError
 from armscan.training.episode_results import Env
 from armscan.volumes import LabelVolume
@@ -101,9 +102,9 @@ class TrainingDomain:
         return notes
 
 
-def smallest_slice(volumes: Collection[LabelVolume]) -> tuple[int, int]:
+def smallest_slice(volumes: Iterable[LabelVolume]) -> tuple[int, int]:
     """Return the largest shape that fits into the slices of all volumes, (across, depth) in pixels."""
-    return min(v.slice_shape[0] for v in volumes), min(v.slice_shape[1] for v in volumes)
+    return smallest_shape([volume.slice_shape for volume in volumes])
 
 
 def with_crops(rules: Any, trained: tuple[int, int], here: tuple[int, int]) -> Any:

@@ -39,12 +39,12 @@ MEANS = {
 Env = gym.Env[Observed, FloatArray]
 
 
-def group_of(name: str) -> str:
+def metric_prefix(name: str) -> str:
     """Return the prefix of the tracked metrics of an evaluation, such as `test_volumes`."""
     return name.replace(" ", "_")
 
 
-TEST_GROUP = group_of(TEST)
+TEST_METRICS = metric_prefix(TEST)
 
 
 @dataclass(frozen=True, kw_only=True)

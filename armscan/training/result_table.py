@@ -189,10 +189,10 @@ def _cell(result: MetricEstimates, column: Quantity, around: str = "{}") -> tupl
 def _count(result: MetricEstimates, name: str) -> str:
     count = getattr(result, name)
     # Metrics of a validation do not have the number of its volumes.
-    is_known = result.n_episodes and (count or name != "n_volumes")
+    has_count = result.n_episodes and (count or name != "n_volumes")
     if name == "n_volumes" and 0 < result.n_subjects < count:
         return f"{count} ({counted(result.n_subjects, 'subject')})"
-    return str(count) if is_known else MISSING
+    return str(count) if has_count else MISSING
 
 
 def _html_cell(result: MetricEstimates, column: Quantity) -> str:

@@ -17,7 +17,7 @@ from armscan.volumes.manifest import (
     volume_entries,
     volume_files,
 )
-from armscan.volumes.read_cache import read_kept, resample_kept
+from armscan.volumes.read_cache import read_cached, resample_cached
 from armscan.volumes.reading import ReadingOptions
 from armscan.volumes.resampling import finest_spacing
 from armscan.volumes.volume import LabelVolume
@@ -87,14 +87,14 @@ def open_dataset(path: str | Path, *, require_manifest: bool = True) -> Dataset:
         raise ManifestError(f"{found}: excludes every volume of the folder")
     volumes, stored = {}, {}
     for name, entry in used.items():
-        volumes[name], stored[name] = read_kept(
+        volumes[name], stored[name] = read_cached(
             files[name],
             ReadingOptions(crop_mm=entry.crop_mm, **{key: manifest.setting(entry, key) for key in SHARED_KEYS}),
             optimal_action=entry.plane,
         )
     if manifest.spacing == "finest":
         spacing = finest_spacing(volumes.values())
-        volumes = {name: resample_kept(volume, spacing) for name, volume in volumes.items()}
+        volumes = {name: resample_cached(volume, spacing) for name, volume in volumes.items()}
     volumes = {name: volume.of_subject(used[name].subject) for name, volume in volumes.items()}
     subjects = {name: entry.subject or name for name, entry in entries.items()}
     splits = None if manifest.splits is None else _split_of(manifest.splits, subjects, used, f"{found}: splits")

@@ -167,7 +167,7 @@ def limit_bytes() -> float:
     return gib * 2**30
 
 
-def kept_if_possible(path: Path, make: Callable[[], Made]) -> Made:
+def cached_volume(path: Path, make: Callable[[], Made]) -> Made:
     """Return a volume as `mapped_volume` does, or one of this process alone if the file cannot be written."""
     try:
         return mapped_volume(path, make)

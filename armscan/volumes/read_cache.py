@@ -25,7 +25,7 @@ from armscan.volumes import (
     volume_report,
 )
 from armscan.volumes.header_checks import TEXT_HEADER_BYTES
-from armscan.volumes.mapped import SUFFIX, Made, kept_if_possible
+from armscan.volumes.mapped import SUFFIX, Made, cached_volume
 from armscan.volumes.plane import ManipulatorAction
 from armscan.volumes.resampling import Spacing, resample
 from armscan.volumes.volume import LabelVolume
@@ -45,7 +45,7 @@ ELSEWHERE = {
 ELSEWHERE["mhd"] = ELSEWHERE["mha"]
 
 
-def read_kept(
+def read_cached(
     path: Path, options: reading.ReadingOptions, optimal_action: ManipulatorAction | None
 ) -> tuple[LabelVolume, StoredFile]:
     """Read a volume as `read_stored` does, or find it in the cache.
@@ -73,15 +73,15 @@ def read_kept(
             raise VolumeError(f"{path}: has changed while it was read")
         return made, details.dump_python(stored, mode="json")
 
-    found, stored = kept_if_possible(_place("labelmap", path.name, digest, options, optimal_action), make)
+    found, stored = cached_volume(_place("labelmap", path.name, digest, options, optimal_action), make)
     return found, details.validate_python(stored)
 
 
-def resample_kept(labelled: LabelVolume, spacing: Spacing) -> LabelVolume:
+def resample_cached(labelled: LabelVolume, spacing: Spacing) -> LabelVolume:
     """Resample a volume as `resample` does, or find it in the cache."""
     world_frame = labelled.origin, labelled.direction.tolist()
     path = _place("resampled", labelled.name, labelled.fingerprint, world_frame, spacing)
-    return kept_if_possible(path, lambda: (resample(labelled, spacing), None))[0]
+    return cached_volume(path, lambda: (resample(labelled, spacing), None))[0]
 
 
 def _digest(path: Path) -> str | None:

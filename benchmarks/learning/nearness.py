@@ -22,7 +22,7 @@ from omegaconf import OmegaConf
 
 from armscan.config.defaults import PHANTOM, default_tracking
 from armscan.evaluation.agent_source import agent_of_run
-from armscan.evaluation.runner import FIRST_SEED, apply
+from armscan.evaluation.runner import FIRST_SEED, prepare_agent
 from armscan.tracking import find_run, open_existing_store
 from armscan.tracking.tags import AGENT_TAG
 from armscan.training import TEST, evaluate
@@ -49,7 +49,7 @@ def played(
     for key, value in changes.items():
         if value is not None:
             OmegaConf.update(subject.config, key, value, force_add=True)
-    prepared = apply(subject, data, N_PHANTOMS)
+    prepared = prepare_agent(subject, data, N_PHANTOMS)
     label = data if data == PHANTOM else TEST
     env = prepared.envs.get(label, list(prepared.envs.values())[-1])
     return list(evaluate(prepared.agent, env, n_episodes=n_episodes, seed=FIRST_SEED).episodes)

@@ -107,7 +107,7 @@ def test_tissue_clusters_reproduce_every_golden_image(golden):
         assert clusters.counts == tuple(golden["counts"][row])
         for index, tissue in enumerate(clusters.each()):
             np.testing.assert_array_equal(tissue.image, golden[f"c{row}"][index], err_msg=f"row {row}, tissue {index}")
-            assert tissue.n_points == golden["points"][row, index]
+            assert tissue.n_pixels == golden["points"][row, index]
             np.testing.assert_allclose(tissue.mean_centre, golden["centre_mean"][row, index], atol=1e-9)
 
 

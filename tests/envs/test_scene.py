@@ -39,7 +39,7 @@ def test_scene_optimum_shows_the_labelled_plane(phantom):
     matrix, _offset_mm = scene.transform.plane_map(scene.optimum)
     assert abs(matrix[:, 1] @ phantom.optimal_action.normal) == pytest.approx(1.0)
     seen = TissueClusters.from_slice(phantom.slice(scene.optimum, transform=scene.transform))
-    assert seen.bones.n_points == pytest.approx(TissueClusters.from_slice(labelled).bones.n_points, rel=0.03)
+    assert seen.bones.n_pixels == pytest.approx(TissueClusters.from_slice(labelled).bones.n_pixels, rel=0.03)
 
 
 DEFORMED = {"scale": 0.1, "stretch": 0.1, "shear": 0.1, "mirror": True}

@@ -8,7 +8,7 @@ from armscan.experiment.job import Invocation
 from armscan.experiment.provenance import start_tracking
 from armscan.runs.query import projection_of
 from armscan.tracking import open_existing_store
-from armscan.tracking.environment import Source
+from armscan.tracking.git import CodeState
 from tests.support.tracked_runs import FEW
 
 
@@ -34,7 +34,7 @@ def test_name_and_tags_of_a_run_are_of_its_environment(tmp_path, database, monke
 
 def test_new_run_keeps_nothing_of_an_earlier_one_in_its_folder(tmp_path, database, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("armscan.experiment.provenance.source", lambda: Source("unknown", None))
+    monkeypatch.setattr("armscan.experiment.provenance.code_state", lambda: CodeState("unknown", None))
     left = ("policy/MLmodel", "code.diff", "resumed_1_code.diff", "reproduction.json", "best.pt")
     (tmp_path / "policy").mkdir()
     for name in (*left, "mine.txt"):

@@ -12,7 +12,8 @@ import pytest
 
 import armscan
 from armscan.cli.main import main
-from armscan.tracking.environment import environment, source
+from armscan.tracking.environment import environment
+from armscan.tracking.git import code_state
 from armscan.tracking.tags import EVALUATED_TAG
 from tests.test_run import SMALL, armscan_run, runs_in
 
@@ -135,7 +136,7 @@ def test_reproduce_lists_what_differs_and_runs_nothing_where_it_is_not_to(made, 
     ):
         code, printed, errors = answer(run.info.run_id, "--dry-run")
     assert (code, errors) == (1, "")
-    assert f"differs: the git commit was {'0' * 40}, and is {source().commit}" in printed
+    assert f"differs: the git commit was {'0' * 40}, and is {code_state().commit}" in printed
     assert f"differs: the sum of constraints.txt was {'1' * 64}, and is" in printed
     assert "differs: changes since the commit had the sum 22222222, and" in printed
     assert f"differs: python was 2.7, and is {environment()['python']}" in printed

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from armscan.tracking.environment import MAX_UNTRACKED_BYTES, source_in
+from armscan.tracking.git import MAX_UNTRACKED_BYTES, code_state_in
 from armscan.utils.files import sha256
 
 NAMES = ["code.py", "blob.bin", "gone.py"]
@@ -47,7 +47,7 @@ def clone_with(diff, repository, folder):
 
 
 def test_source_of_a_clean_tree_is_its_commit_alone(repository):
-    found = source_in(repository / "inner")
+    found = code_state_in(repository / "inner")
     assert found.diff == b""
     commit = git(repository, "rev-parse", "HEAD")
     assert found.tags == {"git.commit": commit, "mlflow.source.git.commit": commit, "git.dirty": "false"}
@@ -64,7 +64,7 @@ def test_source_keeps_every_change_so_that_it_can_be_applied_again(repository, t
     # A user's own display settings.
     git(repository, "config", "color.ui", "always")
     git(repository, "config", "diff.noprefix", "true")
-    found = source_in(repository / "inner")
+    found = code_state_in(repository / "inner")
     assert found.tags["git.dirty"] == "true"
     assert found.tags["git.diff.sha256"] == sha256(found.diff)
     assert contents(clone_with(found.diff, repository, tmp_path)) == contents(repository)
@@ -75,7 +75,7 @@ def test_source_keeps_every_change_so_that_it_can_be_applied_again(repository, t
 def test_source_names_new_files_that_are_too_large_and_leaves_ignored_ones_out(repository, tmp_path):
     (repository / "volume.nii").write_bytes(b"x" * (MAX_UNTRACKED_BYTES + 1))
     (repository / "ignored").write_text("nothing\n")
-    assert source_in(repository).diff == b"# not kept, for its size: 'volume.nii'\n"
+    assert code_state_in(repository).diff == b"# not kept, for its size: 'volume.nii'\n"
 
 
 def test_source_names_a_repository_inside_the_tree_and_keeps_the_rest(repository):
@@ -84,7 +84,7 @@ def test_source_names_a_repository_inside_the_tree_and_keeps_the_rest(repository
     for words in (["init", "--quiet"], ["add", "a.py"], ["commit", "--quiet", "--message", "first"]):
         git(repository / "theirs", *words)
     (repository / "new.py").write_text("b = 2\n")
-    diff = source_in(repository).diff
+    diff = code_state_in(repository).diff
     assert diff.startswith(b"# not kept, because it is a repository of its own: 'theirs/'\n")
     assert b"+b = 2" in diff
     assert b"Subproject" not in diff
@@ -95,7 +95,7 @@ def test_source_keeps_new_files_of_odd_names_and_links(repository, tmp_path):
         (repository / name).write_text("new\n")
     (repository / "broken").symlink_to("nowhere")
     (repository / "to_folder").symlink_to("inner")
-    found = source_in(repository)
+    found = code_state_in(repository)
     clone = clone_with(found.diff, repository, tmp_path)
     assert contents(clone) == contents(repository)
     assert [(clone / name).readlink() for name in ("broken", "to_folder")] == [Path("nowhere"), Path("inner")]
@@ -106,11 +106,11 @@ def test_source_that_git_cannot_compare_is_not_taken_for_clean(repository, damag
     commit = git(repository, "rev-parse", "HEAD")
     if damaged == "index":
         (repository / ".git" / "index").write_bytes(b"nonsense")
-        assert source_in(repository).tags["git.dirty"] == "unknown"
+        assert code_state_in(repository).tags["git.dirty"] == "unknown"
         return
     tree = git(repository, "rev-parse", "HEAD^{tree}")
     (repository / ".git" / "objects" / tree[:2] / tree[2:]).unlink()
-    assert source_in(repository).tags == {
+    assert code_state_in(repository).tags == {
         "git.commit": commit,
         "mlflow.source.git.commit": commit,
         "git.dirty": "unknown",
@@ -122,16 +122,16 @@ def test_source_is_that_of_its_own_repository_despite_the_environment(repository
     git(other, "init", "--quiet")
     commit = git(repository, "rev-parse", "HEAD")
     monkeypatch.setenv("GIT_DIR", str(other / ".git"))
-    assert source_in(repository).commit == commit
+    assert code_state_in(repository).commit == commit
 
 
 def test_source_without_git_is_unknown(repository, tmp_path, monkeypatch):
     (tmp_path / "bare").mkdir()
     unknown = {"git.commit": "unknown", "git.dirty": "unknown"}
-    assert source_in(tmp_path / "bare").tags == unknown
+    assert code_state_in(tmp_path / "bare").tags == unknown
     # A package that lies in the tree of another project, which does not track it.
     (installed := repository / ".venv" / "armscan").mkdir(parents=True)
     (installed / "code.py").write_text("installed\n")
-    assert source_in(installed).tags == unknown
+    assert code_state_in(installed).tags == unknown
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert source_in(repository).tags == unknown
+    assert code_state_in(repository).tags == unknown

@@ -20,12 +20,12 @@ from armscan.experiment.results import RunResult
 from armscan.experiment.runner import keep_results
 from armscan.tracking import (
     TrackedRun,
+    code_state,
     draw_learning_curve,
     find_run,
     load_run,
     open_existing_store,
     open_store,
-    source,
     uploader,
 )
 from armscan.tracking.notes import NOTES_FOLDER, Note, notes
@@ -87,7 +87,7 @@ def test_tracked_run_keeps_parameters_curves_results_and_files(store, tmp_path):
     assert run.info.status == "FINISHED"
     assert run.data.params == {"agent.lr": "0.1", "agent.sizes": "[1, 2]", "seed": "3"}
     assert run.data.tags["overrides"] == "seed=3"
-    assert run.data.tags["git.commit"] == source().tags["git.commit"]
+    assert run.data.tags["git.commit"] == code_state().tags["git.commit"]
     assert run.data.metrics["test_volumes/mean_steps"] == 3.0
     assert run.data.metrics["test_volumes/on_plane_5mm_10deg"] == 1.0
     assert run.data.metrics["test_volumes/mean_steps_low"] == 2.0

@@ -14,7 +14,7 @@ import pytest
 
 from armscan.errors import InvalidValueError
 from armscan.volumes import ManipulatorAction
-from armscan.volumes.mapped import MAGIC, kept_if_possible, limit_bytes, mapped_volume, open_mapped
+from armscan.volumes.mapped import MAGIC, cached_volume, limit_bytes, mapped_volume, open_mapped
 from tests.conftest import make_tiny_volume
 from tests.support import REPOSITORY
 
@@ -160,7 +160,7 @@ def test_limit_is_a_number_of_gib(word, monkeypatch):
 
 
 def test_volume_that_cannot_be_kept_is_used_all_the_same(volume, caplog, capfd):
-    found, about = kept_if_possible(Path("/dev/null/tiny.volume"), lambda: (volume, ABOUT))
+    found, about = cached_volume(Path("/dev/null/tiny.volume"), lambda: (volume, ABOUT))
     assert found is volume
     assert about == ABOUT
     assert "/dev/null: volumes cannot be kept there" in caplog.text + "".join(capfd.readouterr())

@@ -15,7 +15,7 @@ from optuna.trial import FrozenTrial, TrialState
 from optuna.visualization import plot_parallel_coordinate, plot_pareto_front
 from plotly.graph_objects import Figure, Scatter
 
-from armscan.reports.chart_style import BLUE, GREY, ORANGE, RATE_AXIS, RED, mode
+from armscan.reports.chart_style import BLUE, GREY, ORANGE, RATE_AXIS, RED, line_mode
 from armscan.reports.html import chart
 from armscan.sweeps.scheduling.population import searched_values
 from armscan.sweeps.scheduling.state import is_feasible
@@ -106,7 +106,7 @@ def _history(trials: Sequence[FrozenTrial], number: int, objective: str, directi
     numbers, values = [trial.number for trial in feasible], list(map(_value(number), feasible))
     best = list(accumulate(values, max if direction == StudyDirection.MAXIMIZE else min))
     line = {"color": ORANGE, "width": 2, "shape": "hv"}
-    figure.add_scatter(x=numbers, y=best, mode=mode(len(best)), line=line, marker={"size": 4}, name="best so far")
+    figure.add_scatter(x=numbers, y=best, mode=line_mode(len(best)), line=line, marker={"size": 4}, name="best so far")
     return figure.update_layout(height=HEIGHT_PX, xaxis=axis, yaxis=_axis(objective), legend=LEGEND)
 
 
@@ -168,7 +168,7 @@ def _reports(trials: Sequence[FrozenTrial], number: int, objective: str) -> Figu
         figure.add_scatter(
             x=[step for step, _ in points],
             y=[value for _, value in points],
-            mode=mode(len(points)),
+            mode=line_mode(len(points)),
             marker={"symbol": symbols, "size": sizes},
             name=name,
             legendgroup=name,

@@ -29,7 +29,7 @@ from armscan.sweeps.study.final_eval import (
 )
 from armscan.sweeps.study.study import best_trials
 from armscan.training.baselines import RANDOM
-from armscan.training.episode_results import TEST_GROUP
+from armscan.training.episode_results import TEST_METRICS
 from armscan.training.headline import headline
 from armscan.training.metric_display import is_rate, leading_among, title_of, value_text
 from armscan.training.metrics import ENDS
@@ -225,7 +225,7 @@ def best_metrics(search: optuna.Study, judgement: Judgement | None) -> dict[str,
     if judgement is None or (chosen := judgement.of_chosen) is None:
         return found
     of_chosen = chosen.figures.metrics()
-    found |= {f"{TEST_GROUP}/{name}": of_chosen[name] for name in leading_among(of_chosen)}
+    found |= {f"{TEST_METRICS}/{name}": of_chosen[name] for name in leading_among(of_chosen)}
     if (of_random := chosen.baselines.get(RANDOM)) is not None:
         metrics = of_random.metrics()
         found |= {f"{RANDOM}/{name}": metrics[name] for name in leading_among(metrics)}

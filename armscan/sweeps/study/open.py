@@ -27,7 +27,7 @@ from armscan.sweeps.study.settings import StudySettings
 from armscan.sweeps.study.study import fixed_config, make_study, name_objectives
 from armscan.sweeps.study.warm_start import values_of
 from armscan.sweeps.tasks.attempt import Task
-from armscan.tracking import TrackingStore, open_store, run_of_study, source
+from armscan.tracking import TrackingStore, code_state, open_store, run_of_study
 from armscan.tracking.tags import STORAGE_TAG, STUDY_TAG, TRIAL_TAG
 from armscan.utils.retry import RETRY_S
 
@@ -104,7 +104,7 @@ def _tracked_run(
 
     @functools.cache
     def create_run() -> str:
-        tags = {**source().tags, STUDY_TAG: name, STORAGE_TAG: storage.uri, "overrides": " ".join(overrides)}
+        tags = {**code_state().tags, STUDY_TAG: name, STORAGE_TAG: storage.uri, "overrides": " ".join(overrides)}
         return str(client.create_run(experiment_id, name=f"study {name}", tags=tags).info.run_id)
 
     def tracked_run() -> str:
