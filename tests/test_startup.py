@@ -6,6 +6,8 @@ import sys
 
 import pytest
 
+from tests.support.programs import imported_by
+
 LEARNING = {"torch", "tianshou", "ray", "tensorboard", "pettingzoo"}
 HEAVY = LEARNING | {"mlflow", "optuna", "matplotlib", "pandas", "plotly", "scipy.stats", "sqlalchemy"}
 # Runs commands one after another, then prints their exit codes and the imported modules.
@@ -31,6 +33,23 @@ def after(folder, *commands):
     )
     *_, codes, modules = ran.stdout.splitlines()
     return [int(code) for code in codes.split()], ran.stderr, set(modules.split())
+
+
+@pytest.mark.parametrize(
+    ("modules", "absent"),
+    [
+        ("armscan, armscan.envs, armscan.anatomy", LEARNING | {"hydra", "mlflow", "optuna"}),
+        ("armscan.volumes", {"SimpleITK", "slicerio", "pydantic", "torch", "hydra", "mlflow"}),
+        ("armscan.agents", {"optuna"}),
+        ("armscan.cli.main", HEAVY | {"hydra", "SimpleITK"}),
+        ("armscan.cli.main, armscan.annotation.explorer", LEARNING | {"hydra", "mlflow"}),
+        ("armscan.cli.main, armscan.annotation.labelling", LEARNING | {"hydra", "mlflow"}),
+        ("armscan.cli.main, armscan.ui.show", LEARNING | {"mlflow", "optuna", "sqlalchemy"}),
+        ("armscan.run, armscan.sweeps.workers.supervisor", LEARNING | {"mlflow"}),
+    ],
+)
+def test_import_loads_nothing_that_is_not_needed_yet(modules, absent):
+    assert not absent & imported_by(f"import {modules}")
 
 
 def test_words_that_are_wrong_are_answered_before_a_library_of_learning_or_tracking_is_loaded(tmp_path):

@@ -185,10 +185,7 @@ def _cell(estimate: Estimate, form: str, *, apart: str) -> str:
 
 def _plain(metrics: MetricEstimates) -> dict[str, Any]:
     return {
-        "volumes": metrics.n_volumes,
-        "subjects": metrics.n_subjects,
-        "episodes": metrics.n_episodes,
-        "episodes_started_solved": metrics.n_started_solved,
+        **metrics.counts,
         "figures": {
             name: {
                 key: None if math.isnan(number) else number for key, number in metrics.estimate(name)._asdict().items()

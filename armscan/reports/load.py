@@ -23,17 +23,14 @@ from armscan.tracking.store import store_errors
 from armscan.tracking.tags import CHOICE, PRUNED_TAG
 from armscan.training import TEST, Evaluation
 from armscan.training.fingerprints import Fingerprints, fingerprints_in
+from armscan.training.metric_display import title_of
 from armscan.utils.arrays import FloatArray
 from armscan.utils.files import sha256
 from armscan.utils.run_files import BASELINES_FILE, EVALUATION_FILE, ID_CHARS, SHA256_TAGS, VIDEO_FILE, VOLUMES_FILE
 
 WALL = "wall_s"
-VALIDATION = {
-    "validation/success_rate": "success, by reward",
-    "validation/mean_steps": "steps, mean",
-    "validation/mean_return": "return, mean",
-}
 OF_VALIDATION = "validation/"
+VALIDATION = {f"{OF_VALIDATION}{name}": title_of(name) for name in ("success_rate", "mean_steps", "mean_return")}
 # Prefixes of the other metrics that are drawn.
 OF_THE_TRAINING = ("update/", "train/return", "train/length", "speed/")
 # MLflow's value of a parameter that is not set.

@@ -135,10 +135,15 @@ class MetricEstimates:
         """Return all numbers by name as they are shown, the ends of an interval as `..._low` and `..._high`."""
         return self.shown_metrics(self.estimates)
 
+    @property
+    def counts(self) -> dict[str, int]:
+        """Numbers of volumes, subjects and episodes, by `COUNTS`."""
+        counts = (self.n_volumes, self.n_subjects, self.n_episodes, self.n_started_solved)
+        return dict(zip(COUNTS, counts, strict=True))
+
     def shown_metrics(self, names: Iterable[str]) -> dict[str, float]:
         """Return the numbers of these figures as they are shown; see `metrics`."""
-        counts = (self.n_volumes, self.n_subjects, self.n_episodes, self.n_started_solved)
-        metrics: dict[str, float] = dict(zip(COUNTS, counts, strict=True))
+        metrics: dict[str, float] = {**self.counts}
         for name in names:
             metrics |= dict(zip((name, *(name + end for end in ENDS)), self.estimate(name), strict=True))
         return metrics

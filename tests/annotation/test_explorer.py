@@ -13,7 +13,6 @@ from armscan.cli.main import main
 from armscan.envs.rendering import HEIGHT, WIDTH, ReferencePlane, draw_plane, view_of
 from armscan.errors import DisplayError, InvalidValueError
 from armscan.volumes import LabelVolume, ManipulatorAction
-from tests.support.programs import imported_by
 
 MIDDLE = (0.5, 0.5)
 
@@ -179,8 +178,3 @@ def test_explore_without_a_display_is_refused_in_one_line(phantom, capsys):
     finally:
         pyplot.switch_backend(before)
     assert capsys.readouterr().err.startswith("error: no window can be opened (Matplotlib's backend is 'agg'")
-
-
-def test_explore_loads_nothing_of_learning_and_tracking():
-    loaded = imported_by("import armscan.cli.main, armscan.annotation.explorer")
-    assert not loaded & {"torch", "hydra", "mlflow", "tianshou"}

@@ -12,7 +12,6 @@ from armscan.anatomy import find_optimal_plane
 from armscan.cli.main import main
 from armscan.envs import ArmscanEnv
 from armscan.volumes import ManipulatorAction, open_dataset, plane_distance, read_markup, read_volume, write_markup
-from tests.support.programs import imported_by
 
 
 @pytest.fixture
@@ -167,11 +166,6 @@ def test_label_that_is_interrupted_says_so(bare, monkeypatch, capsys):
     monkeypatch.setattr(armscan.annotation.labelling, "find_optimal_plane", interrupt)
     assert main(["data", "label", str(bare)]) == 130
     assert "interrupted" in capsys.readouterr().err
-
-
-def test_label_loads_nothing_of_learning_and_tracking():
-    loaded = imported_by("import armscan.cli.main, armscan.annotation.labelling")
-    assert not loaded & {"torch", "hydra", "mlflow", "tianshou"}
 
 
 @pytest.mark.slow

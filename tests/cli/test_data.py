@@ -1,7 +1,6 @@
 """The command that shows what is in a folder of volumes."""
 
 from armscan.cli.main import main
-from tests.support.programs import imported_by
 
 
 def test_data_command_tells_what_each_volume_holds(write_labelmap, tmp_path, monkeypatch, capsys):
@@ -45,8 +44,3 @@ def test_data_command_answers_a_mistake_in_one_line(tmp_path, capsys):
     error = capsys.readouterr().err
     assert error.startswith("error: ")
     assert len(error.splitlines()) == 1
-
-
-def test_volumes_load_nothing_heavy_until_a_file_is_read():
-    heavy = {"SimpleITK", "slicerio", "pydantic", "torch", "hydra", "mlflow"}
-    assert not heavy & imported_by("import armscan.volumes")

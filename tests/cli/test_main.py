@@ -13,7 +13,6 @@ from armscan.cli.main import armscan as program
 from armscan.cli.main import main
 from armscan.config.defaults import CHANGES
 from armscan.errors import VolumeError
-from tests.support.programs import imported_by
 from tests.support.stores import store_in
 
 
@@ -162,11 +161,6 @@ def test_evaluate_has_an_option_for_each_rule():
     assert CHANGES.keys() <= options
     named = {*("run", "agent", "data", "phantoms", "episodes", "seed", "video", "out", "tracking", "trust")}
     assert options - CHANGES.keys() == named | {"tracking_experiment"}
-
-
-def test_program_loads_nothing_heavy():
-    heavy = {"torch", "hydra", "mlflow", "optuna", "tianshou", "SimpleITK", "matplotlib", "sqlalchemy"}
-    assert not heavy & imported_by("import armscan.cli.main")
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh"])

@@ -12,7 +12,7 @@ from armscan.anatomy import METRIC_TISSUES, AgreementReward, LandmarkReward, Sca
 from armscan.envs import ArmscanEnv, ClusterObservation, ManipulatorAction, RandomTransform
 from armscan.errors import InvalidValueError, ManifestError, OptimalPlaneError, ResetNeededError, VolumeError
 from armscan.volumes import LabelVolume
-from tests.support.programs import imported_by, output_of
+from tests.support.programs import output_of
 
 
 @pytest.fixture
@@ -257,11 +257,6 @@ def test_env_passes_on_what_is_wrong_with_a_folder(tmp_path, write_labelmap):
     write_labelmap()
     with pytest.raises(ManifestError, match=r"optimal_actions\.json"):
         ArmscanEnv(tmp_path)
-
-
-def test_importing_the_environment_loads_no_training_library():
-    loaded = imported_by("import armscan, armscan.envs, armscan.anatomy, armscan.volumes")
-    assert not loaded & {"torch", "tianshou", "hydra", "mlflow", "optuna"}
 
 
 def test_transform_about_the_first_voxel_can_be_chosen(phantom):

@@ -24,7 +24,6 @@ from armscan.sweeps.storage.storage import open_storage
 from tests.reports.conftest import rows
 from tests.support import FEW_VOLUMES
 from tests.support.processes import processes_in, start_run
-from tests.support.programs import imported_by
 from tests.support.waiting import HANG_S, wait_until
 from tests.test_run import armscan_run, runs_in
 from tests.training.test_result_table import recomputed
@@ -337,8 +336,3 @@ def test_study_answers_a_file_that_is_not_for_the_whole_configuration(tmp_path, 
     (tmp_path / "sweeps" / "mine.yaml").write_text("study: {name: mine}\n")
     with pytest.raises(InvalidValueError, match="its file must begin with the line '# @package _global_'"):
         run_study(["-m", "sweep=mine"], launch=pytest.fail)
-
-
-def test_what_watches_over_a_worker_loads_nothing_that_a_worker_trains_and_tracks_with():
-    loaded = imported_by("import armscan.run, armscan.sweeps.workers.supervisor")
-    assert not loaded & {"torch", "mlflow", "tianshou"}

@@ -27,7 +27,6 @@ from tests.support import FEW_VOLUMES
 from tests.support.ports import free_ports
 from tests.support.postgres import PASSWORD
 from tests.support.processes import processes_in, start_run
-from tests.support.programs import imported_by
 from tests.support.waiting import wait_until
 
 SMALL = [
@@ -297,11 +296,6 @@ def test_ui_shows_what_is_in_postgresql_and_no_password(postgres, tmp_path, look
     assert main(["ui", f"--tracking={empty}"]) == 2
     assert "there are no runs there" in capsys.readouterr().err
     assert tables_in(database_url(empty, STORAGE_PASSWORD)) == []
-
-
-def test_ui_loads_nothing_that_trains_or_tracks_before_it_has_to():
-    loaded = imported_by("import armscan.cli.main, armscan.ui.show")
-    assert not loaded & {"torch", "mlflow", "optuna", "sqlalchemy"}
 
 
 @pytest.fixture

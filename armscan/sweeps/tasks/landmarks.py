@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from statistics import fmean
 
 import numpy as np
@@ -15,7 +14,6 @@ from armscan.errors import InvalidValueError
 from armscan.experiment.build import check_keys
 from armscan.sweeps.scheduling.state import TEST_PREFIX
 from armscan.sweeps.tasks.attempt import Attempt, volumes_of
-from armscan.volumes import LabelVolume
 from armscan.volumes.plane import ManipulatorAction
 
 METRICS = ("separation", "labelled_reward", "elsewhere_reward", "worst_labelled_reward")
@@ -50,26 +48,23 @@ class LandmarksTask:
 
     def run(self, attempt: Attempt) -> dict[str, float]:
         """Return the metrics on the training volumes. See `Task.run`."""
-        config, _ = attempt.config(attempt.seeds[0])
-        return self._run_task(config, volumes_of(config).training)
+        return self._measured(attempt, "training")
 
     def validate(self, attempt: Attempt) -> dict[str, float]:
         """Return the metrics on the validation volumes. See `Task.validate`."""
-        config, _ = attempt.config(attempt.seeds[0])
-        return self._run_task(config, volumes_of(config).validation)
+        return self._measured(attempt, "validation")
 
     def evaluate(self, attempt: Attempt) -> dict[str, float]:
         """Return the metrics on the test volumes. See `Task.evaluate`."""
-        config, _ = attempt.config(attempt.seeds[0])
-        metrics = self._run_task(config, volumes_of(config).test)
-        return {f"{TEST_PREFIX}{name}": value for name, value in metrics.items()}
+        return {f"{TEST_PREFIX}{name}": value for name, value in self._measured(attempt, "test").items()}
 
-    def _run_task(self, config: DictConfig, volumes: Mapping[str, LabelVolume]) -> dict[str, float]:
-        """Return the metrics on these volumes, by the reward as trainings have it: fitted to the training volumes."""
-        tissues = self._tissues(config)
-        reward = instantiate(config.reward, _convert_="object").fit(volumes_of(config).training.values(), tissues)
+    def _measured(self, attempt: Attempt, part: str) -> dict[str, float]:
+        """Return the metrics on a part of the volumes, by the reward as fitted to the training part."""
+        config, _ = attempt.config(attempt.seeds[0])
+        tissues, volumes = self._tissues(config), volumes_of(config).parts
+        reward = instantiate(config.reward, _convert_="object").fit(volumes["training"].values(), tissues)
         at_plane, elsewhere = [], []
-        for volume in volumes.values():
+        for volume in volumes[part].values():
             scorer, labelled = PlaneScorer(volume, reward, tissues), volume.optimal_action
             if labelled is None:
                 raise InvalidValueError(f"{volume.name}: has no labelled plane, which clusterings are judged by")
