@@ -146,6 +146,8 @@ def _print_dataset(dataset: Dataset) -> None:
         style="bold",
         highlight=False,
     )
+    if n_labelled < n_volumes:
+        console.print("find the other planes with armscan data label FOLDER", highlight=False)
 
 
 def _tissue_table(report: VolumeReport) -> Table:

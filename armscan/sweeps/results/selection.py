@@ -17,7 +17,7 @@ from armscan.sweeps.results.judgement import Judgement
 from armscan.sweeps.scheduling.race import END_LEVEL, Race
 from armscan.sweeps.scheduling.state import CONTROL, StudyState
 from armscan.sweeps.space.parameter import overrides_of
-from armscan.sweeps.storage.attribute_names import OBJECTIVES
+from armscan.sweeps.storage.attribute_names import FIXED, OBJECTIVES
 from armscan.sweeps.study.final_eval import NOTHING_SEARCHED, FinalEvaluation, key_of, name_of, settings_of
 from armscan.training.metric_display import bounds_of, is_rate, title_of, value_text
 from armscan.utils.text import counted
@@ -81,13 +81,21 @@ def candidates_of(final: FinalEvaluation) -> list[Candidate]:
             Candidate(
                 number,
                 {seed: sign * score for seed, score in sorted(scores.items())},
-                estimate.clipped(*bounds_of(objective_of(final))),
+                estimate.clipped(*_bounds(final)),
                 standing.n_seeds,
                 _outcome(race, number),
                 " ".join(overrides_of(settings_of(searched, number))),
             )
         )
     return sorted(found, key=lambda each: (each.number != race.chosen, -each.n_seeds, -sign * each.estimate.value))
+
+
+def _bounds(final: FinalEvaluation) -> tuple[float, float]:
+    """Return the lowest and the highest value of the objective; steps end at `env.max_steps`, unless it is searched."""
+    least, most = bounds_of(objective_of(final))
+    if objective_of(final).endswith("_steps"):
+        most = final.search.user_attrs[FIXED].get("env.max_steps", most)
+    return least, most
 
 
 def _outcome(race: Race, number: int) -> str:
