@@ -194,23 +194,15 @@ def test_manifest_may_repeat_itself_as_yaml_allows(folder):
     assert dataset.volumes["b.nrrd"].shape == dataset.volumes["a.nii.gz"].shape[::-1]
 
 
-def test_record_planes_tells_entries_apart_that_yaml_has_as_one(folder):
-    written(folder, "volumes: {a.nii.gz: &same {subject: S1}, b.nrrd: *same}")
-    record_planes(folder, {"a.nii.gz": (ACTION, -0.01)})
-    dataset = open_dataset(folder)
-    assert dataset.volumes["a.nii.gz"].optimal_action == ACTION
-    assert dataset.volumes["b.nrrd"].optimal_action is None
-    assert dataset.subjects == {"a.nii.gz": "S1", "b.nrrd": "S1"}
-
-
 @pytest.mark.parametrize(
     "text",
     [
+        "volumes: {a.nii.gz: &same {subject: S1}, b.nrrd: *same}",
         "volumes:\n  a.nii.gz: &one\n    subject: S1  # left\n  b.nrrd: {<<: *one}\n",
         "volumes:\n  b.nrrd: {<<: &one {subject: S1}}\n  a.nii.gz: *one\n",
     ],
 )
-def test_record_planes_gives_a_plane_to_no_entry_that_merges_the_labelled_one(folder, text):
+def test_record_planes_gives_a_plane_to_no_entry_that_repeats_the_labelled_one(folder, text):
     record_planes(written(folder, text), {"a.nii.gz": (ACTION, -0.01)})
     dataset = open_dataset(folder)
     assert dataset.volumes["a.nii.gz"].optimal_action == ACTION
