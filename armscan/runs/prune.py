@@ -18,7 +18,7 @@ from armscan.tracking import TrackingStore, check_version
 from armscan.tracking.client import reason_in
 from armscan.tracking.notes import forget
 from armscan.tracking.sync import ENDED
-from armscan.tracking.tags import FOLDER_TAG, PARENT_TAG
+from armscan.tracking.tags import AGENT_TAG, FOLDER_TAG, PARENT_TAG, TRIAL_TAG
 from armscan.utils.run_files import BEST_CHECKPOINT, LAST_CHECKPOINT
 
 CHECKPOINTS, FOLDERS = "checkpoints", "folders"
@@ -47,6 +47,9 @@ def plan(client: TrackingStore, runs: Sequence[Run], what: str) -> list[PruneIte
         noted[run.data.tags.get(FOLDER_TAG)].add(run_id)
     items = []
     for run in runs:
+        # The run of a trial has no files: its seeds have.
+        if TRIAL_TAG in run.data.tags and AGENT_TAG not in run.data.tags:
+            continue
         try:
             folder = _folder(run, everything, noted[run.data.tags.get(FOLDER_TAG)] - {run.info.run_id})
             with folder.held(is_planned=True):

@@ -56,6 +56,16 @@ def test_folders_leave_the_store(answer, make_run, tmp_path):
     assert (ids_in(tmp_path), len(artifacts_of(tmp_path, run_id))) == ({run_id}, 3)
 
 
+def test_run_of_a_trial_which_has_no_files_is_not_listed(answer, make_run, store, tmp_path):
+    client, experiment_id = store
+    run_id = make_run()
+    trial = client.create_run(experiment_id, name="trial 3", tags={"trial": "3", "folder": str(tmp_path)}).info.run_id
+    printed = answer("prune", "folders")[1]
+    assert run_id[:8] in printed
+    assert trial[:8] not in printed
+    assert "folders of 1 of 1 runs would be removed" in printed
+
+
 def kept_files():
     """Return the checkpoints and configurations below the folder that the command is in, with their contents."""
     return {file: file.read_bytes() for file in Path.cwd().rglob("*") if file.suffix in (".pt", ".yaml")}
