@@ -280,6 +280,8 @@ def test_run_on_labelmap_files(tmp_path, data_folder):
             "there is no key 'path' in data, but only n_training, n_validation, n_test, first_seed, cache_dir or "
             "version: data.path needs data=nifti or data=mixed",
         ),
+        (["agent=plane_finder", "network=mlp"], "'network=mlp' has no effect: agent=plane_finder has a network of its"),
+        (["-m", "agent=plane_finder", "network=mlp,auto"], "'network=mlp' has no effect: agent=plane_finder has"),
         (["seed=-1"], "seed is -1, but it must be a whole number of at least 0"),
         (["stack=0"], "stack is 0, but it must be a whole number of at least 1"),
         (

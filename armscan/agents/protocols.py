@@ -95,8 +95,8 @@ class AgentSetup:
         total_env_steps: Budget of the training, in environment steps.
         seed: Seed of the environments, networks and replay buffer.
         compute: Device and precision of the tensors.
-        n_steps: Number of steps of an episode whose last plane is the answer; its rewards do not end it. Default: None,
-            episodes end at the first success.
+        n_steps: Number of steps of an episode that does not end at its first success; its last plane is the answer.
+            Default: None, episodes end at the first success.
         make_validation_envs: Factory of environments on the validation volumes, for learners that fit parameters there.
             Default: None, for an agent that does not learn.
     """

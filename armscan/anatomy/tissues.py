@@ -95,7 +95,7 @@ class MetricTissue:
         if ROUNDING * self.eps_mm < max(across_mm, depth_mm):
             raise InvalidValueError(
                 f"eps_mm of label {self.label} is {self.eps_mm:g}, but with pixels of {across_mm:g} x {depth_mm:g} mm "
-                f"it must be at least {max(across_mm, depth_mm):g}: below, pixels have no neighbours; "
+                f"it must be at least {max(across_mm, depth_mm):g}: below, pixels have no neighbours along an axis; "
                 "take clustering=pixels, or a larger eps_mm"
             )
         half_widths = disc_half_widths(ROUNDING * self.eps_mm, across_mm, depth_mm)
@@ -119,10 +119,11 @@ PIXEL_TISSUES = Tissues(
 
 # Finds what the pixel mode finds at its own spacing, and the same at any other with pixels of up to about 0.55 mm. From
 # 0.6 mm on, the artery's pixels have no neighbours.
+MAX_METRIC_PIXEL_MM = 0.6
 METRIC_TISSUES = Tissues(
     MetricTissue(label=1, eps_mm=1.6, density=0.94),
     MetricTissue(label=2, eps_mm=1.2, density=0.62),
-    MetricTissue(label=3, eps_mm=0.6, density=0.8),
+    MetricTissue(label=3, eps_mm=MAX_METRIC_PIXEL_MM, density=0.8),
 )
 CLUSTERINGS: dict[str, Tissues] = {"pixels": PIXEL_TISSUES, "metric": METRIC_TISSUES}
 

@@ -41,7 +41,7 @@ def inspect(folder: str) -> None:
     # Deferred: `--help` needs none of it.
     from armscan.volumes import open_dataset
 
-    _print_dataset(open_dataset(folder, require_manifest=False))
+    _print_dataset(open_dataset(folder, require_manifest=False), folder)
 
 
 @data.command(epilog=examples("data label wrists", "data label wrists --volume a.nii.gz --markup moved.mrk.json"))
@@ -127,7 +127,7 @@ def explore(folder: str | None, volume: str | None, clustering: str | None) -> N
     pyplot.show()
 
 
-def _print_dataset(dataset: Dataset) -> None:
+def _print_dataset(dataset: Dataset, folder: str) -> None:
     """Print a table for each volume, and the excluded volumes."""
     # Lines of a file or a pipe are never wrapped.
     console = wide_console(WHOLE_CHARS)
@@ -147,7 +147,9 @@ def _print_dataset(dataset: Dataset) -> None:
         highlight=False,
     )
     if n_labelled < n_volumes:
-        console.print("find the other planes with armscan data label FOLDER", highlight=False)
+        from armscan.config.command_hints import armscan_command
+
+        console.print(Text(f"find the missing planes: {armscan_command('data', 'label', folder)}"))
 
 
 def _tissue_table(report: VolumeReport) -> Table:

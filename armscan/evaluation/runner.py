@@ -8,6 +8,7 @@ from functools import cache, partial
 
 from armscan.agents import Agent, Learner
 from armscan.anatomy import USUAL_PIXEL_MM
+from armscan.anatomy.tissues import MAX_METRIC_PIXEL_MM
 from armscan.config.command_hints import resume_command
 from armscan.envs import EnvFactory
 from armscan.errors import CheckpointError, InvalidValueError, OptimalPlaneError, listed, printable, reason_of
@@ -169,10 +170,11 @@ def _env(env_factory: EnvFactory, volumes: VolumesByName, clustering: object, re
         )
         if clustering != "pixels" or is_usual:
             raise
+        can_be_metric = max(map(max, sizes)) <= MAX_METRIC_PIXEL_MM
         usual, *shown = (f"{across:.3g} x {depth:.3g}" for across, depth in (USUAL_PIXEL_MM, *sorted(sizes)))
         raise InvalidValueError(
             f"{error}; clusters are found by pixels, as suits about {usual} mm, and here a pixel has {listed(shown)} "
-            "mm: unless the plane is wrong, --clustering metric may see them"
+            "mm" + (": unless the plane is wrong, --clustering metric may see them" if can_be_metric else "")
         ) from error
 
 

@@ -14,7 +14,7 @@ from armscan.config.error_messages import one_line_message
 from armscan.errors import InvalidValueError
 from armscan.evaluation.agent_source import TrainedAgent
 from armscan.training import PARTS, TEST, TRAINING, VALIDATION, Split, check_unchanged
-from armscan.utils.files import check_writable
+from armscan.utils.files import check_writable, sha256
 from armscan.volumes import LabelVolume, load_phantoms, open_dataset
 from armscan.volumes.dataset import SPLITS
 from armscan.volumes.phantom import VERSIONS
@@ -90,8 +90,15 @@ def data_name(data: str | None) -> str:
 
 def file_name(*parts: str) -> str:
     """Return strings as a valid file name, each shortened so that up to four of them, and an ending, fit."""
-    valid = (re.sub(r"[^\w.\-]+", "-", part).encode() for part in parts)
-    return "-".join(part[:MAX_PART_BYTES].decode(errors="ignore") for part in valid)
+    return "-".join(map(_shortened, parts))
+
+
+def _shortened(part: str) -> str:
+    valid = re.sub(r"[^\w.\-]+", "-", part).encode()
+    if len(valid) > MAX_PART_BYTES:
+        # Names that begin alike stay apart.
+        valid = valid[: MAX_PART_BYTES - 9] + f"-{sha256(valid)[:8]}".encode()
+    return valid.decode(errors="ignore")
 
 
 def check_out(file: Path, out: Path | None, what: str) -> None:

@@ -14,6 +14,7 @@ from armscan.agents import (
     Agent,
     Compute,
     Learner,
+    PlaneFinder,
     scheduled_algorithms,
 )
 from armscan.config.compose import build_section
@@ -171,15 +172,13 @@ def check_each_seen(key: str, n_episodes: int, part: str, split: Split) -> None:
 
 
 def check_network(config: DictConfig, overrides: Sequence[str]) -> None:
-    """Check that overrides of the network concern the agent, which may have a network of its own.
-
-    Raises:
-        InvalidValueError: If the agent's configuration does not refer to `network`.
-    """
+    """Raise `InvalidValueError` if overrides choose the network of a plane finder, which has one of its own."""
     given = next((each for each in overrides if re.match(r"[+~]*network[=.]", each)), None)
-    if given and "${network" not in str(OmegaConf.to_container(config.agent, resolve=False)):
-        agent = config.agent.get("_target_")
-        raise InvalidValueError(f"{given!r} has no effect: {agent} has a network of its own, configured in agent")
+    if given and type(make_algorithm(config)) is PlaneFinder:
+        raise InvalidValueError(
+            f"{given!r} has no effect: agent=plane_finder has a network of its own, with agent.filters and "
+            "agent.hidden_sizes"
+        )
 
 
 def check_config(config: DictConfig) -> None:

@@ -48,9 +48,10 @@ VOLUME_PREFIX = "volume/"
 NAMES = {metric_prefix(name): name for name in (TEST, TRAINING)} | {"validation": LAST_VALIDATION}
 # With fewer wrists intervals are clearly too narrow: docs/metrics.md.
 MIN_WRISTS = 8
+MORE_HELP = "more wrists would help"
 WHAT_HELPS = (
-    "more wrists would help: of phantoms data.n_validation and data.n_test, of a folder data=mixed or cross-validation "
-    "(data.folds=leave_one_out)"
+    f"{MORE_HELP}: data.n_validation and data.n_test with phantoms; data=mixed or cross-validation "
+    "(data.folds=leave_one_out) with a folder"
 )
 
 
@@ -199,18 +200,17 @@ def volume_notes(test: MetricEstimates, validation: MetricEstimates | None = Non
                 "the intervals do not overlap: volumes differ more than episodes do, and other wrists may lie anywhere "
                 f"between or outside; {WHAT_HELPS}"
             ]
-    return few_wrists({"test ": test} | ({"validation ": validation} if validation is not None else {}))
+    return few_wrists({"test ": test} | ({"validation ": validation} if validation is not None else {}), WHAT_HELPS)
 
 
-def few_wrists(figures: Mapping[str, MetricEstimates]) -> list[str]:
+def few_wrists(figures: Mapping[str, MetricEstimates], helps: str = MORE_HELP) -> list[str]:
     """Return a note if intervals come from too few wrists.
 
     Args:
         figures: Metrics by the word that describes the wrists, which ends with a blank, or is empty.
+        helps: What helps. Default: more wrists.
     """
     few = [counted(each.n_subjects, f"{of}wrist") for of, each in figures.items() if each.n_subjects < MIN_WRISTS]
     if not few:
         return []
-    return [
-        f"{' and '.join(few)}, fewer than {MIN_WRISTS}: the intervals are too narrow for other wrists; {WHAT_HELPS}"
-    ]
+    return [f"{' and '.join(few)}, fewer than {MIN_WRISTS}: the intervals are too narrow for other wrists; {helps}"]

@@ -56,6 +56,7 @@ def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict
         The metrics of the final evaluations, by the name of their volumes.
     """
     check_keys(config)
+    check_network(config, invocation.overrides)
     job = invocation.job
     told = log_compilation(COMPILING, lambda dispatcher: dispatcher.py_func.__module__.startswith(OF_ENVIRONMENT))
     with folder_lock(invocation.folder):
@@ -64,8 +65,6 @@ def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict
             with told:
                 setup = set_up(config)
             check_episodes(setup)
-            if isinstance(setup.agent, Learner):
-                check_network(config, invocation.overrides)
             tracked = start_tracking(config, invocation, setup)
         return run_tracked(setup, tracked, invocation.folder, config.tracking.uri, job_label=job.label if job else None)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import html
 import json
 import math
-import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -27,7 +26,7 @@ ALL_FOLDS = ", all folds"
 AGENT = f"agent{ALL_FOLDS}"
 
 
-def folds_table(runs: Iterable[tuple[Path, str]]) -> ResultTable | None:
+def folds_table(runs: Iterable[tuple[Path, Sequence[str]]]) -> ResultTable | None:
     """Return one table over the folds of a grid, with the baselines; None if it is not a grid of folds.
 
     Every subject is tested once for each seed, so that intervals resample subjects, as those of one run do.
@@ -38,8 +37,7 @@ def folds_table(runs: Iterable[tuple[Path, str]]) -> ResultTable | None:
     # By title, training and fold.
     tested: dict[str, dict[str, dict[str, Evaluation]]] = {}
     for folder, varied in runs:
-        # Values may contain blanks.
-        words = dict(word.partition("=")[::2] for word in re.split(r" (?=[+~]*[\w.@/]+=)", varied))
+        words = dict(word.partition("=")[::2] for word in varied)
         if (fold := words.pop(FOLD, None)) is None:
             return None
         training = words.pop(SEED, "")

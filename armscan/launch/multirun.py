@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import json
+import shlex
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -245,7 +246,14 @@ def _pool_folds(
     from armscan.launch.folds_table import AGENT, folds_table, keep_table
 
     finished = [run for run in runs if outcomes[run.data.tags[JOB_TAG]].failure is None]
-    table = folds_table((Path(run.data.tags[FOLDER_TAG]), outcomes[run.data.tags[JOB_TAG]].varied) for run in finished)
+    words = {number: shlex.split(outcome.overrides) for number, outcome in outcomes.items()}
+    table = folds_table(
+        (
+            Path(run.data.tags[FOLDER_TAG]),
+            [word for word in words[run.data.tags[JOB_TAG]] if word not in parent["common"]],
+        )
+        for run in finished
+    )
     if table is None:
         return False
     left_out = len(outcomes) - len(finished)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -34,8 +34,10 @@ METAIMAGE_FIELDS = ("NDims", "DimSize", "ElementType", "ElementDataFile")
 NRRD_TYPES = {"char": 1, "uchar": 1, "int8": 1, "uint8": 1, "short": 2, "short int": 2, "ushort": 2, "int16": 2}
 NRRD_TYPES |= {"uint16": 2, "int": 4, "uint": 4, "int32": 4, "uint32": 4, "longlong": 8, "long long": 8}
 NRRD_TYPES |= {"long long int": 8, "ulonglong": 8, "int64": 8, "uint64": 8, "float": 4, "double": 8}
-# The last two: not stated.
-MILLIMETRES = ("mm", "millimeter", "millimeters", "millimetre", "millimetres", "?", "")
+# Units of length besides mm; the axis of a segmentation's layers may have any other.
+OTHER_LENGTHS = {f"{prefix}{unit}" for prefix in ("", "centi", "micro", "nano") for unit in ("meter", "metre")}
+OTHER_LENGTHS |= {f"{name}s" for name in OTHER_LENGTHS} | {"m", "cm", "um", "\u00b5m", "\u03bcm", "nm"}
+OTHER_LENGTHS |= {"micron", "microns", "in", "inch", "inches"}
 NRRD_ENCODINGS = {"raw": None, "gzip": GZIP, "gz": GZIP}
 
 
@@ -48,6 +50,7 @@ def check_nrrd(path: Path, needed: Sequence[str] = ()) -> None:
     _check_nrrd_spacing(path, fields)
     for name in ("space units", "units"):
         _check_units(path, name, re.findall(r'"([^"]*)"', fields.get(name, "")))
+    _check_finite(path, "space origin", fields, re.findall(r"[^\s(),]+", fields.get("space origin", "")))
     for name in ("type", "dimension", "sizes", "encoding", *needed):
         if name not in fields:
             raise VolumeError(f"{path}: the file gives no {name}, but it must")
@@ -88,8 +91,7 @@ def check_metaimage(path: Path) -> None:
     check_spacing(path, [_number(word) for word in spacing.split()])
     _check_units(path, "DistanceUnits", [fields.get("DistanceUnits", "")])
     for name in ("Offset", "Position", "Origin"):
-        if not all(math.isfinite(_number(word)) for word in fields.get(name, "").split()):
-            raise VolumeError(f"{path}: {name} is {fields[name]!r}, but it must be finite numbers")
+        _check_finite(path, name, fields, fields.get(name, "").split())
     sizes = [_whole(path, "DimSize", word) for word in fields["DimSize"].split()]
     kind = fields["ElementType"]
     if kind not in METAIMAGE_TYPES or fields["NDims"] != str(len(sizes)):
@@ -164,8 +166,13 @@ def _check_nrrd_spacing(path: Path, fields: dict[str, str]) -> None:
 
 def _check_units(path: Path, name: str, units: Sequence[str]) -> None:
     """Raise `VolumeError` if a header states units of length other than mm, which SimpleITK ignores."""
-    if other := [unit for unit in units if unit.lower() not in MILLIMETRES]:
+    if other := [unit for unit in units if unit.strip().lower() in OTHER_LENGTHS]:
         raise VolumeError(f"{path}: {name} is {other[0]!r}, but only volumes in mm are read")
+
+
+def _check_finite(path: Path, name: str, fields: Mapping[str, str], words: Sequence[str]) -> None:
+    if not all(math.isfinite(_number(word)) for word in words):
+        raise VolumeError(f"{path}: {name} is {fields[name]!r}, but it must be finite numbers")
 
 
 def _beside(path: Path, name: str) -> Path:

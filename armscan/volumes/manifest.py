@@ -148,7 +148,7 @@ def _recorded(
     if read_with is not None:
         changed = [name for name in recorded if _reading_of(manifest, name) != _reading_of(read_with, name)]
         if changed:
-            raise ManifestError(f"{path}: now reads {few(changed)} in another way than its plane was found in")
+            raise ManifestError(f"{path}: its settings for {few(changed)} have changed since; look for the plane again")
     entries = document.get("volumes")
     entries = {name: {} for name in files} if entries is None else entries
     entries = {**entries, **{name: {**entries.get(name, {}), **keys} for name, keys in recorded.items()}}
@@ -167,7 +167,9 @@ def _recorded(
 
 def _reading_of(manifest: Manifest, name: str) -> tuple[Any, ...]:
     """Return all that determines the frame of a volume."""
-    entry = volume_entries(manifest, dict.fromkeys(manifest.volumes or [name], Path()), None)[name]
+    from armscan.volumes.manifest_schema import VolumeEntry
+
+    entry = (manifest.volumes or {}).get(name) or VolumeEntry()
     return manifest.spacing, entry.crop_mm, *(manifest.setting(entry, key) for key in SHARED_KEYS)
 
 

@@ -32,7 +32,7 @@ def _named(text: str) -> str:
 def _subjects(value: Any) -> tuple[str, ...]:
     if not isinstance(value, list | tuple) or not value or not all(isinstance(name, str) and name for name in value):
         raise InvalidValueError(f"a split is {value!r}, but it must be a list of at least one subject (strings)")
-    return tuple(map(_named, value))
+    return tuple(value)
 
 
 Rotation = Annotated[

@@ -45,8 +45,8 @@ LONGEST_HEADER = 544
 MAX_OFFSET = 1 << 24
 # Between the spacings of the header and of the sform, both of which many programs round.
 SPACING_TOLERANCE = 1e-3
-# Between qform and sform: the cosines of the axes, and the origin in voxels.
-PLACE_TOLERANCE = 0.01
+# Between qform and sform: the cosines of the axes, and the origin in units of the smallest spacing.
+COSINE_TOLERANCE, ORIGIN_TOLERANCE = 0.01, 0.1
 
 
 def check_nifti(path: Path) -> None:
@@ -126,5 +126,9 @@ def _check_one_place(path: Path, steps: Sequence[float], place: Sequence[float])
     sform = np.reshape(place[6:], (3, 4))
     cosines = sform[:, :3] / np.linalg.norm(sform[:, :3], axis=0)
     moved = np.linalg.norm(sform[:, 3] - offset) / min(steps[1:])
-    if max(np.abs(cosines - turned).max(), moved) > PLACE_TOLERANCE:
-        raise VolumeError(f"{path}: its qform and its sform state different places in the world: correct one of them")
+    if np.abs(cosines - turned).max() > COSINE_TOLERANCE or moved > ORIGIN_TOLERANCE:
+        origins = (", ".join(f"{number:g}" for number in each) for each in (offset, sform[:, 3]))
+        raise VolumeError(
+            f"{path}: qform and sform state different places in the world (origins ({') and ('.join(origins)})): copy "
+            "the right one over the other, as with fslorient"
+        )

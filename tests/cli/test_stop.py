@@ -53,6 +53,11 @@ def test_study_is_stopped_by_its_name_and_by_its_run(answer, study, run_with):
     assert stops_of(study)[1]
 
 
+def test_stopped_study_without_a_running_trial_says_so(answer, study):
+    study.tell(0, 1.0)
+    assert answer("a") == (0, "study a: no trial is running; the same command resumes it, unless it has ended\n", "")
+
+
 def test_trial_is_stopped_by_its_run(answer, study, run_with):
     printed = "trial 0 of study a will end at its next report, as pruned; it counts as finished\n"
     assert answer(run_with(study="a", trial="0")) == (0, printed, "")

@@ -56,6 +56,11 @@ def test_conf_composes_every_agent_and_experiment(override):
     assert np.abs(action).max() <= 1.0
 
 
+def test_cluster_observation_takes_a_reward_without_targets():
+    assert compose(["~reward.targets"]).obs.targets == [4, 3, 1]
+    assert compose(["reward.targets=[1,2,3]"]).obs.targets == [1, 2, 3]
+
+
 @pytest.mark.parametrize("clustering", ["pixels", "metric"])
 @pytest.mark.parametrize("wrappers", [["stack=3"], ["memory=2"], ["stack=2", "memory=3", "stack_memory=true"]], ids=str)
 def test_conf_composes_wrappers_and_clusterings(phantom, wrappers, clustering):

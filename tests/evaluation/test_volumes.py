@@ -6,6 +6,7 @@ import shutil
 import pytest
 import yaml
 
+from armscan.evaluation.volumes import file_name
 from tests.support.tracked_runs import GUESSER, ON_FILES, tracked, written
 
 
@@ -76,6 +77,13 @@ def test_volumes_of_the_training_are_known_under_other_names_and_others_under_th
     assert f"note: the agent was trained on these volumes: copy.nii.gz (there {one})\n" in printed
     assert "note: the agent's checkpoint was chosen on volumes of these names, but with other voxels" in printed
     assert f"or another plane: {third}\n" in printed
+
+
+def test_file_names_of_long_names_are_short_and_stay_apart():
+    names = {file_name("random", f"{'v' * 230}{number}", "seed0") for number in range(3)}
+    assert len(names) == 3
+    assert max(map(len, names)) < 100
+    assert file_name("my run", "ü" * 80).isprintable()
 
 
 def test_phantoms_are_of_the_version_that_the_run_was_trained_on(evaluate, tmp_path):

@@ -93,6 +93,7 @@ def test_section_that_builds_something_else_is_refused(phantom, monkeypatch, sec
 
 @pytest.mark.parametrize("override", ["network=mlp", "network.vector.hidden_sizes=[8]"])
 def test_network_of_an_agent_that_has_its_own_is_refused(override):
-    check_network(compose(["agent=residual_sac", override]), [override])
-    with pytest.raises(InvalidValueError, match=r"'network.*' has no effect: armscan\.agents\.PlaneFinder has"):
+    for agent in ("residual_sac", "exhaustive", "sac"):
+        check_network(compose([f"agent={agent}", override]), [override])
+    with pytest.raises(InvalidValueError, match=r"'network.*' has no effect: agent=plane_finder has"):
         check_network(compose(["agent=plane_finder", override]), ["agent=plane_finder", override])

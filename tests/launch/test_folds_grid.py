@@ -115,13 +115,18 @@ def left_by_a_run(folder, volume, distances_mm):
     return folder
 
 
+def table_of(runs):
+    """Return the table of runs, each with the words that differ."""
+    return folds_table([(folder, varied if isinstance(varied, list) else varied.split()) for folder, varied in runs])
+
+
 def test_table_puts_the_wrists_of_all_folds_together(tmp_path):
     runs = [
         (left_by_a_run(tmp_path / f"{fold}-{seed}", f"wrist{fold}", distances), f"data.fold={fold} seed={seed}")
         for seed, of_folds in enumerate([([1.0, 2.0], [5.0, 6.0]), ([3.0, 4.0], [7.0, 8.0])])
         for fold, distances in enumerate(of_folds)
     ]
-    table = folds_table(runs)
+    table = table_of(runs)
     figures = table.results[AGENT]
     assert (figures.n_seeds, figures.n_volumes, figures.n_episodes) == (2, 2, 8)
     assert figures.estimate("median_distance_mm").value == 4.5
@@ -131,7 +136,7 @@ def test_table_puts_the_wrists_of_all_folds_together(tmp_path):
     first = [json.loads((folder / "evaluation.json").read_text())[TEST] for folder, _ in runs[:2]]
     alone = Evaluation(tuple(each for one in first for each in Evaluation.of_dict(one).episodes))
     expected = MetricEstimates.of(alone).estimate("median_distance_mm")
-    found = folds_table([(path, varied.split()[0]) for path, varied in runs[:2]]).results[AGENT]
+    found = table_of([(path, varied.split()[0]) for path, varied in runs[:2]]).results[AGENT]
     assert found.estimate("median_distance_mm") == pytest.approx(expected)
 
 
@@ -140,10 +145,10 @@ def test_folds_that_a_seed_lacks_are_left_out_of_the_table(tmp_path):
         (left_by_a_run(tmp_path / f"{fold}-{seed}", f"wrist{fold}", [1.0]), f"data.fold={fold} seed={seed}")
         for fold, seed in ((0, 0), (0, 1), (1, 1))
     ]
-    results = folds_table(runs).results
+    results = table_of(runs).results
     assert (results[AGENT].n_seeds, results[AGENT].n_volumes) == (2, 1)
     assert (results["random, all folds"].n_volumes, results["random, all folds"].n_episodes) == (1, 1)
-    assert folds_table([runs[0], runs[2]]) is None
+    assert table_of([runs[0], runs[2]]) is None
 
 
 def test_every_wrist_counts_alike_however_many_a_fold_has(tmp_path):
@@ -151,7 +156,7 @@ def test_every_wrist_counts_alike_however_many_a_fold_has(tmp_path):
     runs = [
         (left_by_a_run(tmp_path / name, name, each), f"data.fold={name}") for name, each in (("a", near), ("b", far))
     ]
-    figures = folds_table(runs).results[AGENT]
+    figures = table_of(runs).results[AGENT]
     assert (figures.n_volumes, figures.n_episodes) == (2, 4)
     assert figures.estimate("on_plane_5mm_10deg").value == 0.5
 
@@ -159,7 +164,7 @@ def test_every_wrist_counts_alike_however_many_a_fold_has(tmp_path):
 def test_page_and_description_of_all_folds_say_what_is_missing(tmp_path, database):
     store, experiment_id = store_in(tmp_path, "a")
     run_id = store.create_run(experiment_id, name="grid", tags={}).info.run_id
-    table = folds_table([(left_by_a_run(tmp_path / "a", "wrist", [1.0]), "data.fold=0")])
+    table = table_of([(left_by_a_run(tmp_path / "a", "wrist", [1.0]), "data.fold=0")])
     jobs = jobs_table({"1": JobOutcome("", "data.fold=1", failure="out of memory")}, {})
     keep_table(table, jobs, tmp_path, store, run_id, ["1 of 2 jobs are missing"])
     shown = (tmp_path / RESULTS_PAGE).read_text()
@@ -182,12 +187,15 @@ def test_no_job_is_the_best_of_those_that_are_tested_on_other_wrists():
 
 def test_table_keeps_kinds_of_runs_apart_and_a_grid_without_folds_has_none(tmp_path):
     runs = [
-        (left_by_a_run(tmp_path / f"{fold}-{agent[:3]}", f"wrist{fold}", [1.0]), f"agent={agent} data.fold={fold}")
+        (
+            left_by_a_run(tmp_path / f"{fold}{agent[:3]}", f"wrist{fold}", [1.0]),
+            [f"agent={agent}", f"data.fold={fold}"],
+        )
         # A value may contain blanks.
-        for agent in ("sac", "{lr: 0.1, gamma: 0}")
+        for agent in ("sac", "{note: a b=c, gamma: 0}")
         for fold in range(2)
     ]
-    titles = ["agent, all folds, agent=sac", "agent, all folds, agent={lr: 0.1, gamma: 0}"]
-    assert [title for title in folds_table(runs).results if title.startswith("agent")] == titles
-    assert folds_table([(path, "seed=1") for path, _ in runs]) is None
-    assert folds_table([]) is None
+    titles = ["agent, all folds, agent=sac", "agent, all folds, agent={note: a b=c, gamma: 0}"]
+    assert [title for title in table_of(runs).results if title.startswith("agent")] == titles
+    assert table_of([(path, "seed=1") for path, _ in runs]) is None
+    assert table_of([]) is None

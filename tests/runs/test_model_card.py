@@ -13,7 +13,7 @@ from tests.support.stores import store_in
 from tests.training.test_train import evaluation_of
 
 OWN = {"test volumes": evaluation_of(2, 4).to_dict()}
-FACTS = {"data": "own volumes", "changes": {"success_threshold": 0.2}}
+FACTS = {"data": "configured volumes", "changes": {"success_threshold": 0.2}}
 BY_COMMAND = EvaluationReport({"test volumes": evaluation_of(6)}, has_total=False, facts=FACTS).to_dict()
 
 

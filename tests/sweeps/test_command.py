@@ -160,7 +160,9 @@ def test_study_ends_by_itself_where_the_noise_between_seeds_is_larger_than_what_
     told = re.search(f"the study has ended by itself: ({reason})", unwrapped(ended.stdout))
     assert float(told[2]) < float(told[3])
     # The plan gives the same reason, and the same command prints the same result without a worker.
-    assert told[1] in unwrapped(armscan_run(*words, "--plan", cwd=tmp_path).stdout)
+    plan = unwrapped(armscan_run(*words, "--plan", cwd=tmp_path).stdout)
+    assert told[1] in plan
+    assert "the rest nothing: the study has finished" in " ".join(plan.split())
     again = armscan_run(*words, cwd=tmp_path)
     assert again.returncode == 0
     assert again.stdout.partition("best while searching")[2] == ended.stdout.partition("best while searching")[2] != ""

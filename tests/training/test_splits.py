@@ -224,7 +224,7 @@ def test_every_subject_is_tested_on_in_one_fold(folder, folds):
         ({"folds": 1, "fold": 0}, "data.folds is 1"),
         ({"folds": "loo", "fold": 0}, "data.folds is 'loo', but it must be 'leave_one_out' or a number"),
         ({"folds": 2, "fold": 2}, "data.fold is 2, but it must be .* at most 1"),
-        ({"fold": 2}, "data.fold is 2, but data.folds is None"),
+        ({"fold": 2}, "data.fold is 2, but data.folds is null"),
         ({"folds": 2, "fold": 0, "test": 0.5}, "data.folds is 2, which says what is tested on, but data.test is 0.5"),
         ({"folds": 2, "fold": 0, "validation": ["S", "T", "U"]}, "data.test|both name"),
     ],

@@ -23,6 +23,8 @@ from armscan.training.metric_display import bounds_of, is_rate, title_of, value_
 from armscan.utils.text import counted
 
 ROW_PX, AROUND_PX = 44, 110
+# Metrics of the length of an episode.
+STEPS = ("mean_steps", "iqm_steps")
 
 
 class Candidate(NamedTuple):
@@ -91,9 +93,9 @@ def candidates_of(final: FinalEvaluation) -> list[Candidate]:
 
 
 def _bounds(final: FinalEvaluation) -> tuple[float, float]:
-    """Return the lowest and the highest value of the objective; steps end at `env.max_steps`, unless it is searched."""
+    """Return the lowest and the highest value of the objective; an episode has at most `env.max_steps`, if fixed."""
     least, most = bounds_of(objective_of(final))
-    if objective_of(final).endswith("_steps"):
+    if objective_of(final) in STEPS:
         most = final.search.user_attrs[FIXED].get("env.max_steps", most)
     return least, most
 

@@ -284,6 +284,14 @@ def test_interval_of_a_rate_ends_at_0_and_100_percent(monkeypatch, storage_uri):
     assert all(0.0 <= each.low <= each.high <= 1.0 for each in intervals)
 
 
+def test_interval_of_steps_ends_at_the_longest_episode(storage_uri):
+    final = run(storage_uri, true={0: 6.0, 1: 1.2, 2: 5.0, CONTROL: 9.9})
+    final.search.set_user_attr("fixed_config", {"env.max_steps": 10})
+    highs = [each.estimate.high for each in candidates_of(final) if math.isfinite(each.estimate.low)]
+    assert max(highs) == 10
+    assert candidates_of(final)[0].estimate.low >= 1.0
+
+
 def test_study_that_goes_on_says_for_whom_else_the_test_volumes_were_opened(storage_uri):
     run(storage_uri)
     _, _, search = searched(storage_uri)
