@@ -173,6 +173,8 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
         _print_resume_commands(parent, runs)
     if store is not None and not runs:
         remove_run_folder(folder)
+        if is_interrupted:
+            print("no run had begun: type the command again", file=sys.stderr)
     return 0 if status == "FINISHED" else 1
 
 
