@@ -51,7 +51,7 @@ def run(ctx: click.Context) -> int:
 )
 @click.version_option(package_name="armscan")
 def armscan() -> None:
-    """Train and evaluate agents that find the carpal tunnel's plane in labelmaps of the arm.
+    """Train and evaluate agents that find the carpal tunnel's plane in labelmaps of the wrist.
 
     armscan COMMAND --help explains a command.
     """
