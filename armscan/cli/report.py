@@ -27,7 +27,12 @@ PLACES = {"study": "storage", "runs": "tracking"}
     help="Compare these runs: MLflow run IDs or their beginnings. A grid or a trial stands for all trainings below "
     "it, experiment:NAME for an MLflow experiment.",
 )
-@click.option("--out", type=FILE_PATH, metavar="FOLDER", help="Folder of the report.  [default: a new one in reports]")
+@click.option(
+    "--out",
+    type=FILE_PATH,
+    metavar="FOLDER",
+    help="Folder of the report.  [default: one in reports]",
+)
 @click.option("--watch", is_flag=True, help="Write the report of a study again and again until Ctrl-C; it refreshes.")
 @storage_option(help="Optuna storage of the study.")
 @tracking_option(help="MLflow tracking store of the runs.")

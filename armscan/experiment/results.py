@@ -25,7 +25,7 @@ from armscan.training import (
 )
 from armscan.training.baselines import RANDOM
 from armscan.training.episode_results import TEST_METRICS, metric_prefix
-from armscan.training.headline import ABOVE_RANDOM, beside_random, headline
+from armscan.training.headline import ABOVE_RANDOM, MIN_WRISTS, beside_random, headline
 from armscan.training.metric_display import LEADING
 from armscan.utils.files import atomic_write
 from armscan.utils.run_files import BASELINES_FILE, EVALUATION_FILE, RESULTS_PAGE
@@ -46,8 +46,6 @@ EVALUATED = "/success_rate"
 # Of the metrics of a single volume in an evaluation.
 VOLUME_PREFIX = "volume/"
 NAMES = {metric_prefix(name): name for name in (TEST, TRAINING)} | {"validation": LAST_VALIDATION}
-# With fewer wrists intervals are clearly too narrow: docs/metrics.md.
-MIN_WRISTS = 8
 MORE_HELP = "more wrists would help"
 WHAT_HELPS = (
     f"{MORE_HELP}: data.n_validation and data.n_test with phantoms; data=mixed or cross-validation "

@@ -10,13 +10,12 @@ from armscan.config.defaults import FOLD
 from armscan.stats.on_plane import leading_of
 from armscan.tracking import TrackingStore
 from armscan.tracking.outbox import now_ms
+from armscan.tracking.tags import BEST_TAG
 from armscan.training.baselines import RANDOM
 from armscan.training.episode_results import TEST_METRICS
 from armscan.training.metric_display import leading_among
 
 TESTED = f"{TEST_METRICS}/"
-# Tag of the grid's run: the run that its figures come from.
-BEST_TAG = "best.run"
 
 
 def best_of(runs: Sequence[Run]) -> Run | None:

@@ -13,8 +13,8 @@ from armscan.config.defaults import FOLD
 from armscan.reports.html import page
 from armscan.training import TEST, Evaluation, MetricEstimates, ResultTable
 from armscan.training.baselines import RANDOM
-from armscan.training.episode_results import TEST_METRICS
-from armscan.training.headline import beside_random, headline
+from armscan.training.episode_results import TEST_METRICS, metric_prefix
+from armscan.training.headline import ABOVE_RANDOM, beside_random, headline
 from armscan.utils.files import atomic_write
 from armscan.utils.run_files import BASELINES_FILE, EVALUATION_FILE, RESULTS_PAGE
 
@@ -26,13 +26,14 @@ ALL_FOLDS = ", all folds"
 AGENT = f"agent{ALL_FOLDS}"
 
 
-def folds_table(runs: Iterable[tuple[Path, Sequence[str]]]) -> ResultTable | None:
+def folds_table(runs: Iterable[tuple[Path, Sequence[str]]], n_folds: int | None = None) -> ResultTable | None:
     """Return one table over the folds of a grid, with the baselines; None if it is not a grid of folds.
 
     Every subject is tested once for each seed, so that intervals resample subjects, as those of one run do.
 
     Args:
         runs: Folder of each run, and its overrides that differ from those of the others.
+        n_folds: Number of folds of the grid. If some were not tested, the rows say so. Default: None, all were.
     """
     # By title, training and fold.
     tested: dict[str, dict[str, dict[str, Evaluation]]] = {}
@@ -67,6 +68,11 @@ def folds_table(runs: Iterable[tuple[Path, Sequence[str]]]) -> ResultTable | Non
         random = next(iter(joined[of_random].values())) if of_random in joined else None
         ours[title] = beside_random(figures[title], [*joined[title].values()], random)
         randoms |= {title: figures[of_random]} if random else {}
+    which = ALL_FOLDS if n_folds in (None, len(common)) else f", {len(common)} of {n_folds} folds"
+    figures, ours, randoms = (
+        {title.replace(ALL_FOLDS, which, 1): of_title for title, of_title in each.items()}
+        for each in (figures, ours, randoms)
+    )
     return ResultTable(figures | ours, headline=headline(ours, randoms)) if figures else None
 
 
@@ -103,13 +109,14 @@ def keep_table(
     text = page("all folds (test)", f"{said}{table.html()}<h2>Jobs</h2>{jobs.html()}")
     atomic_write(file, text)
     time_ms = now_ms()
-    groups = {title: TEST_METRICS if title == AGENT else title.removesuffix(ALL_FOLDS) for title in table.results}
+    groups = {title: metric_prefix(title.removesuffix(ALL_FOLDS)) for title in table.results} | {AGENT: TEST_METRICS}
+    shown = [*(column.metric for column in table.quantities), ABOVE_RANDOM]
     metrics = [
         Metric(f"{group}/{name}", value, time_ms, 0)
         for title, group in groups.items()
-        # If runs also differ in other settings, only the page has their figures.
+        # If runs also differ in other settings, or folds are missing, only the page has their figures.
         if title.endswith(ALL_FOLDS)
-        for name, value in table.results[title].shown_metrics(column.metric for column in table.quantities).items()
+        for name, value in table.results[title].shown_metrics(shown).items()
         if math.isfinite(value)
     ]
     store.log_batch(run_id, metrics=metrics)

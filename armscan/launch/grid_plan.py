@@ -31,7 +31,7 @@ def print_grid_plan(words: Sequence[str]) -> None:
         HydraException: If a job cannot be composed.
     """
     overrides = [word for word in with_folds([word for word in words if word != PLAN]) if word not in MULTIRUN]
-    parsed, jobs = _jobs_of(overrides)
+    parsed, jobs = jobs_of(overrides)
     if len(jobs) == 1:
         raise InvalidValueError(
             f"{PLAN} is given, but this is a single run: it shows the jobs of a grid, and what a study searches "
@@ -59,7 +59,7 @@ def check_grid(words: Sequence[str]) -> None:
     from armscan.experiment.build import check_config, check_network
 
     errors = []
-    _, jobs = _jobs_of(overrides)
+    _, jobs = jobs_of(overrides)
     for job in jobs:
         config = compose(job)
         try:
@@ -72,7 +72,7 @@ def check_grid(words: Sequence[str]) -> None:
     raise errors[0]
 
 
-def _jobs_of(overrides: Sequence[str]) -> tuple[list[Override], list[list[str]]]:
+def jobs_of(overrides: Sequence[str]) -> tuple[list[Override], list[list[str]]]:
     """Return the overrides of a grid, parsed, and those of each job."""
     # Of `glob(...)`, the loader tells which choices there are.
     with config_loader() as loader:

@@ -19,7 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from armscan.config.command_hints import armscan_command, resume_command, run_command
 from armscan.config.credentials import check_address
-from armscan.config.defaults import TRACKING_URI, to_plain
+from armscan.config.defaults import FOLD, TRACKING_URI, to_plain
 from armscan.config.error_messages import one_line_message
 from armscan.config.trust import needs_trust, untrusted_word
 from armscan.errors import InvalidValueError, TrackingError
@@ -245,26 +245,26 @@ def _pool_folds(
     """Print one table over all folds of a cross-validation, and save it above the table of the jobs; False without."""
     from armscan.experiment.console import print_result_table
     from armscan.experiment.results import few_wrists
-    from armscan.launch.folds_table import AGENT, folds_table, keep_table
+    from armscan.launch.folds_table import folds_table, keep_table
+    from armscan.launch.grid_plan import jobs_of
 
+    if not any(word.startswith(f"{FOLD}=") for word in parent["overrides"]):
+        return False
+    planned = [dict(word.partition("=")[::2] for word in job) for job in jobs_of(parent["overrides"])[1]]
     finished = [run for run in runs if outcomes[run.data.tags[JOB_TAG]].failure is None]
-    words = {number: shlex.split(outcome.overrides) for number, outcome in outcomes.items()}
-    table = folds_table(
-        (
-            Path(run.data.tags[FOLDER_TAG]),
-            [word for word in words[run.data.tags[JOB_TAG]] if word not in parent["common"]],
-        )
-        for run in finished
-    )
+    varied = {
+        number: [word for word in shlex.split(outcome.overrides) if word not in parent["common"]]
+        for number, outcome in outcomes.items()
+    }
+    tested = [(Path(run.data.tags[FOLDER_TAG]), varied[run.data.tags[JOB_TAG]]) for run in finished]
+    table = folds_table(tested, len({job[FOLD] for job in planned}))
     if table is None:
         return False
-    left_out = len(outcomes) - len(finished)
-    missing = (
-        f"{left_out} of {len(outcomes)} jobs are missing: the table is over the folds that all seeds were tested on"
-    )
-    of_agent = next(figures for title, figures in table.results.items() if title.startswith(AGENT))
+    left_out = len(planned) - len(finished)
+    missing = f"{left_out} of {len(planned)} jobs are missing: the table is over the folds that all seeds tested on"
+    title, of_agent = next(each for each in table.results.items() if each[0].startswith("agent, "))
     notes = [*([missing] if left_out else []), *few_wrists({"test ": of_agent})]
-    print_result_table("all folds (test)", table, notes)
+    print_result_table(f"{title.split(', ')[1]} (test)", table, notes)
     keep_table(table, jobs, folder, store, parent["run_id"], notes)
     return True
 

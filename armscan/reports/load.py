@@ -155,16 +155,15 @@ def read_trainings(store: TrackingStore, runs: Sequence[Run], folder: Path) -> l
         leading = {f"{OF_VALIDATION}{leading_of(migrate(run.data.params)).metric}" for run in runs}
         shown = {WALL, *VALIDATION, *leading}
         histories = metric_histories(store, {run.info.run_id: _wanted(run, shown) for run in runs})
-        files = [_files(store, run, folder / run.info.run_id) for run in runs]
+        # Not by run ID, which a stranger's store may have as a path.
+        files = [_files(store, run, folder / str(number)) for number, run in enumerate(runs)]
     return [_training(run, histories[run.info.run_id], of_run) for run, of_run in zip(runs, files, strict=True)]
 
 
 def _training(run: Run, histories: Mapping[str, History], files: Mapping[str, bytes]) -> TrackedTraining:
     tags, series = run.data.tags, _series(histories)
     evaluation = _parsed(run, files, EVALUATION_FILE, lambda contents: Evaluation.of_dict(contents[TEST]))
-    baselines = _parsed(
-        run, files, BASELINES_FILE, lambda contents: {name: Evaluation.of_dict(each) for name, each in contents.items()}
-    )
+    baselines = _parsed(run, files, BASELINES_FILE, _played)
     params = migrate(run.data.params)
     # The tag of its own run: other seeds of a pruned trial may have run to their end.
     is_pruned = PRUNED_TAG in tags
@@ -182,6 +181,12 @@ def _training(run: Run, histories: Mapping[str, History], files: Mapping[str, by
         volumes=_parsed(run, files, VOLUMES_FILE, lambda contents: fingerprints_in(contents, VOLUMES_FILE)),
         video=files.get(VIDEO_FILE),
     )
+
+
+def _played(contents: Mapping[str, Any]) -> dict[str, Evaluation]:
+    """Return evaluations by name, those with episodes."""
+    evaluations = {name: Evaluation.of_dict(each) for name, each in contents.items()}
+    return {name: each for name, each in evaluations.items() if each.episodes}
 
 
 def _wanted(run: Run, shown: Collection[str]) -> list[str]:

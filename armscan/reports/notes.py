@@ -10,6 +10,7 @@ from armscan.reports.groups import Group, differing_rules
 from armscan.reports.load import TrackedTraining
 from armscan.reports.significance import evaluations_by_seed
 from armscan.stats.aggregation import MIN_SEEDS
+from armscan.training.headline import MIN_WRISTS
 
 # From this number of seeds on, the intervals of final figures are nearly as wide as they should be.
 MANY_SEEDS = 5
@@ -20,6 +21,7 @@ def notes_on(groups: Sequence[Group], left_out: Sequence[TrackedTraining], *, ha
     notes = [
         *_on_folds(groups),
         *_on_seeds(groups),
+        *_on_wrists(groups),
         *_on_unfinished(groups),
         *_on_missing(groups),
         *_on_volumes(groups),
@@ -63,6 +65,15 @@ def _on_seeds(groups: Sequence[Group]) -> Iterator[str]:
             f"{_numbered(few, groups)}: with few seeds the intervals of the final figures are too narrow; those of "
             f"curves (from {MIN_SEEDS} seeds on) and of the probabilities below are not."
         )
+
+
+def _on_wrists(groups: Sequence[Group]) -> Iterator[str]:
+    n_wrists = {}
+    for group in groups:
+        played = [episode for each in evaluations_by_seed(group).values() for episode in each.episodes]
+        n_wrists[group.number] = len({episode.subject or episode.volume for episode in played})
+    if few := [number for number, n in n_wrists.items() if 0 < n < MIN_WRISTS]:
+        yield f"{_numbered(few, groups)}: fewer than {MIN_WRISTS} test wrists; intervals are too narrow for others."
 
 
 def _on_unfinished(groups: Sequence[Group]) -> Iterator[str]:

@@ -76,8 +76,8 @@ def compare_groups(groups: Sequence[Group]) -> dict[str, list[Pair]]:
 
 def have_same_volumes(groups: Sequence[Group]) -> bool:
     """Return whether all groups were evaluated on the same volumes."""
-    volumes = [*map(_volumes, groups)]
-    return all(_are_same(volumes[0], each) for each in volumes[1:])
+    volumes = [_volumes(group) for group in groups if group.tested]
+    return all(_are_same(volumes[0], each) for each in volumes)
 
 
 def complement(probability: Estimate) -> Estimate:
@@ -103,8 +103,12 @@ def baseline_metrics(groups: Sequence[Group]) -> list[dict[str, MetricEstimates]
 
 
 def _baselines(group: Group) -> dict[str, list[Evaluation]]:
-    """Return the baselines' evaluations by name, one for each fold."""
-    of_fold = {each.fold: each.baselines for each in reversed(group.tested) if each.baselines}
+    """Return the baselines' evaluations by name, one for each fold; none if its seeds had different test volumes."""
+    if _volumes(group) is None:
+        return {}
+    # In the order of a grid's own table, so that intervals are the same.
+    tested = sorted(group.tested, key=lambda each: (len(each.fold or ""), each.fold or ""), reverse=True)
+    of_fold = {each.fold: each.baselines for each in reversed(tested) if each.baselines}
     names = dict.fromkeys(name for baselines in of_fold.values() for name in baselines)
     return {name: [each[name] for each in of_fold.values() if name in each] for name in names}
 

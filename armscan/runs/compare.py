@@ -114,7 +114,13 @@ def difference(metric: str, then: Mapping[int, float], now: Mapping[int, float])
     n_missing, n_new = len(then.keys() - now.keys()), len(now.keys() - then.keys())
     if not common:
         return Difference(metric, 0, n_missing, n_new)
-    # The difference of two equal infinities would be NaN.
-    sizes = {step: 0.0 if then[step] == now[step] else abs(then[step] - now[step]) for step in common}
+    sizes = {step: _size(then[step], now[step]) for step in common}
     at = max(common, key=lambda step: sizes[step])
     return Difference(metric, len(common), n_missing, n_new, sizes[at], at, then[at], now[at])
+
+
+def _size(then: float, now: float) -> float:
+    """Return the size of a difference: 0 for equal infinities or two NaNs, infinite if one alone is NaN."""
+    if then == now or (math.isnan(then) and math.isnan(now)):
+        return 0.0
+    return math.inf if math.isnan(then - now) else abs(then - now)

@@ -17,7 +17,7 @@ from armscan.runs.rows import RunRow, artifacts_of
 from armscan.runs.run_folder import OwnFolder, RunSkippedError
 from armscan.runs.tables import format_duration, narrow_table
 from armscan.tracking import TrackingStore
-from armscan.tracking.tags import EVALUATED_TAG, FAILURE_TAG, PARENT_TAG
+from armscan.tracking.tags import BEST_TAG, EVALUATED_TAG, FAILURE_TAG, PARENT_TAG
 from armscan.utils.console import wide_console
 from armscan.utils.run_files import BEST_CHECKPOINT, ID_CHARS, LAST_CHECKPOINT
 
@@ -87,7 +87,8 @@ def _print_figures(console: Console, run: Run) -> None:
     metrics = run.data.metrics
     table = evaluation_table(metrics) if EVALUATED_TAG in run.data.tags else result_table(figures_of(metrics))
     if table.results:
-        console.print("\nfigures", style="bold")
+        best = run.data.tags.get(BEST_TAG)
+        console.print(f"\nfigures{f' of its best job, {best[:ID_CHARS]}' if best else ''}", style="bold")
         for part in table.show(console.width):
             console.print(part)
 

@@ -18,7 +18,7 @@ from armscan.runs.prune import PruneItem
 from armscan.runs.query import projection_of
 from armscan.runs.rows import RunRow
 from armscan.stats.on_plane import ON_PLANE
-from armscan.tracking.tags import AGENT_TAG, FOLDER_TAG, HOST_TAG, OBS_TAG, PARENT_TAG
+from armscan.tracking.tags import AGENT_TAG, BEST_TAG, FOLDER_TAG, HOST_TAG, OBS_TAG, PARENT_TAG
 from armscan.utils.console import print_table, wide_console
 from armscan.utils.csv_file import write_csv
 from armscan.utils.run_files import ID_CHARS
@@ -69,6 +69,7 @@ def _print_table(rows: Sequence[RunRow]) -> None:
     for row in rows:
         on_plane, success, steps = row.on_plane_rate, row.success_rate, row.mean_steps
         size = decimal(row.n_bytes) + ("" if row.in_store is not None else "+?")
+        best = "best " if BEST_TAG in row.run.data.tags else ""
         within = "" if len(limits) == 1 else " ({:g} mm {:g}°)".format(*row.on_plane)
         cells.append(
             [
@@ -76,7 +77,7 @@ def _print_table(rows: Sequence[RunRow]) -> None:
                 row.run.info.status.lower(),
                 format_start(row.run),
                 format_duration(row.duration_s),
-                MISSING if on_plane is None else f"{formatted(PERCENT, on_plane)}{within}",
+                MISSING if on_plane is None else f"{best}{formatted(PERCENT, on_plane)}{within}",
                 MISSING if success is None else formatted(PERCENT, success),
                 MISSING if steps is None else f"{steps:.1f}",
                 size,
@@ -110,7 +111,18 @@ def narrow_table(*headings: str) -> Table:
 COLUMNS = (
     *("run_id", "name", "status", "experiment_id", "parent", "started", "duration_s"),
     *("on_plane_rate", "on_plane_mm", "on_plane_deg", "success_rate", "mean_steps"),
-    *("size_bytes", "folder_bytes", "artifact_bytes", "below", "agent", "obs", "projection", "folder", "host"),
+    *(
+        "size_bytes",
+        "folder_bytes",
+        "artifact_bytes",
+        "below",
+        "agent",
+        "obs",
+        "projection",
+        "folder",
+        "host",
+        "best_run",
+    ),
 )
 
 
@@ -122,7 +134,7 @@ def _values(row: RunRow) -> dict[str, Any]:
         *(row.on_plane_rate, *row.on_plane, row.success_rate, row.mean_steps),
         *(row.n_bytes, row.in_folder, row.in_store, len(row.below)),
         *(tags.get(AGENT_TAG), tags.get(OBS_TAG), projection_of(row.run)),
-        *(tags.get(FOLDER_TAG), tags.get(HOST_TAG)),
+        *(tags.get(FOLDER_TAG), tags.get(HOST_TAG), tags.get(BEST_TAG)),
     )
     return dict(zip(COLUMNS, values, strict=True))
 

@@ -17,6 +17,8 @@ EVALUATED_TAG = "evaluation.of"
 FAILURE_TAG = "failure"
 # Of a job's run: its number. Of a grid's run: the arguments that repeat it.
 JOB_TAG, GRID_TAG = "job", "grid"
+# Of a grid's run: the run of its best job, whose figures it shows.
+BEST_TAG = "best.run"
 # Of a study's runs: its name and storage, the number of the trial, and whether the trial was pruned.
 STUDY_TAG, STORAGE_TAG, TRIAL_TAG, PRUNED_TAG = "study", "study.storage", "trial", "pruned"
 # Prefix of metrics that a study measures to select a configuration; no other run has them.

@@ -21,6 +21,8 @@ SUREST, LEAST_SURE = "_surest_quarter", "_least_sure_quarter"
 # Suffixes of the ends of an interval, and the names of the counts.
 ENDS = ("_low", "_high")
 COUNTS = ("volumes", "subjects", "episodes", "episodes_started_solved")
+# Tracked if there are several.
+SEEDS = "seeds"
 MEDIAN, P90, P95 = quantile(0.5), quantile(0.9), quantile(0.95)
 
 # Metrics by name: the statistic, and the value of an episode that it summarises.
@@ -118,13 +120,14 @@ class MetricEstimates:
     def of_metrics(cls, metrics: Mapping[str, float]) -> MetricEstimates:
         """Return estimates from the numbers of `metrics` or of a run; without an interval if its ends are missing."""
         ends = {name + end for name in metrics for end in ENDS if name + end in metrics}
-        n_volumes, n_subjects, n_episodes, n_started_solved = (int(metrics.get(name, 0)) for name in COUNTS)
+        n_volumes, n_subjects, n_episodes, n_solved = (int(metrics.get(name, 0)) for name in COUNTS)
+        n_seeds = int(metrics.get(SEEDS, 1))
         found = {
             name: Estimate(value, *(metrics.get(name + end, math.nan) for end in ENDS))
             for name, value in metrics.items()
-            if name not in ends and name not in COUNTS
+            if name not in ends and name not in (*COUNTS, SEEDS)
         }
-        return cls(1, n_volumes, n_subjects, n_episodes, n_started_solved, found, limits_among(found))
+        return cls(n_seeds, n_volumes, n_subjects, n_episodes, n_solved, found, limits_among(found))
 
     def estimate(self, name: str) -> Estimate:
         """Return a figure as it is shown: NaN if there is none; with Wilson's interval if its own has no width."""
@@ -143,7 +146,7 @@ class MetricEstimates:
 
     def shown_metrics(self, names: Iterable[str]) -> dict[str, float]:
         """Return the numbers of these figures as they are shown; see `metrics`."""
-        metrics: dict[str, float] = {**self.counts}
+        metrics: dict[str, float] = {**self.counts, **({SEEDS: self.n_seeds} if self.n_seeds > 1 else {})}
         for name in names:
             metrics |= dict(zip((name, *(name + end for end in ENDS)), self.estimate(name), strict=True))
         return metrics

@@ -149,6 +149,10 @@ def test_folds_that_a_seed_lacks_are_left_out_of_the_table(tmp_path):
     assert (results[AGENT].n_seeds, results[AGENT].n_volumes) == (2, 1)
     assert (results["random, all folds"].n_volumes, results["random, all folds"].n_episodes) == (1, 1)
     assert table_of([runs[0], runs[2]]) is None
+    # A grid of three folds that was interrupted.
+    table = folds_table([(runs[0][0], ["data.fold=0"])], n_folds=3)
+    assert list(table.results) == ["agent, 1 of 3 folds", "random, 1 of 3 folds"]
+    assert "all folds" not in table.headline
 
 
 def test_every_wrist_counts_alike_however_many_a_fold_has(tmp_path):

@@ -6,7 +6,7 @@ import pytest
 
 from armscan.reports.comparison import write_comparison
 from armscan.reports.groups import group_trainings
-from armscan.reports.significance import compare_groups, final_metrics
+from armscan.reports.significance import baseline_metrics, compare_groups, final_metrics, have_same_volumes
 from armscan.training import Evaluation
 from tests.reports.conftest import make_episode, rows
 
@@ -197,3 +197,15 @@ def test_figures_of_one_evaluation_are_of_all_its_episodes(make_training):
 def test_one_tested_seed_is_told_also_among_seeds_that_were_only_searched_with(written, make_training):
     page, _ = written(make_training(0), *(make_training(seed, evaluation=None) for seed in range(1, 6)))
     assert "one seed says nothing about other seeds" in page
+
+
+def test_group_whose_seeds_were_tested_on_other_volumes_is_not_set_beside_random_planes(make_training):
+    random = {"random": Evaluation((make_episode("v0", 9),))}
+    one, other = (
+        make_training(seed, evaluation=Evaluation((make_episode(volume, 1),)), baselines=random)
+        for seed, volume in enumerate(("v0", "v1"))
+    )
+    (mixed,), _ = group_trainings([one, other])
+    (alone,), _ = group_trainings([one])
+    assert [have_same_volumes([group]) for group in (alone, mixed)] == [True, False]
+    assert [len(each) for each in baseline_metrics([alone, mixed])] == [1, 0]

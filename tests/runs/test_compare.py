@@ -1,17 +1,22 @@
 """Two runs compared."""
 
+import math
+
 from hypothesis import given
 from hypothesis import strategies as st
 
 from armscan.runs.compare import Comparison, difference
 
-POINTS = {"keys": st.integers(0, 9), "values": st.floats(allow_nan=False), "max_size": 6}
+POINTS = {"keys": st.integers(0, 9), "values": st.floats(), "max_size": 6}
 SOME, ANY = st.dictionaries(**POINTS, min_size=1), st.dictionaries(**POINTS)
 
 
 @given(SOME, ANY)
 def test_difference_is_none_exactly_where_every_point_of_the_first_is_there_again(then, now):
-    is_there_again = all(step in now and now[step] == value for step, value in then.items())
+    is_there_again = all(
+        step in now and (now[step] == value or (math.isnan(now[step]) and math.isnan(value)))
+        for step, value in then.items()
+    )
     assert difference("m", then, now).is_same == is_there_again
 
 

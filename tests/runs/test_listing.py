@@ -177,6 +177,15 @@ def test_on_plane_rate_is_within_the_limits_that_each_run_is_configured_with(mak
     assert "3 mm" in answer("list", "--limit=1", "--sort=plane")[1]
 
 
+def test_grid_says_that_its_figures_are_those_of_its_best_job(make_run, store, answer):
+    client, _ = store
+    grid = make_run("grid", figures={"test_volumes/on_plane_5mm_10deg": 0.5, "test_volumes/success_rate": 0.5})
+    client.set_tag(grid, "best.run", "b" * 32)
+    assert "best 50%" in answer("list")[1]
+    assert "b" * 32 in answer("list", "--format=csv")[1]
+    assert f"figures of its best job, {'b' * 8}" in answer("show", grid)[1]
+
+
 def test_show_tells_everything_of_a_run(make_run, store, answer, tmp_path):
     tags = {"overrides": "agent=sac seed=3", "git.commit": 40 * "a", "something.new": "[red]x"}
     figures = {"validation/success_rate": 0.75, **judged(0.5, 9.25), "volume/a/success_rate": 0.1}

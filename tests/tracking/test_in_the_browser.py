@@ -6,8 +6,9 @@ from functools import partial
 import pytest
 from mlflow.entities import Metric, Param
 
-from armscan.launch.best_job import BEST_TAG, show_best
+from armscan.launch.best_job import show_best
 from armscan.tracking import TrackedRun
+from armscan.tracking.tags import BEST_TAG
 from armscan.tracking.uploader import set_description
 from armscan.tracking.view import VIEW, VIEW_TAG
 from tests.support.stores import store_in

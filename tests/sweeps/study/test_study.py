@@ -66,7 +66,7 @@ def test_study_goes_on_where_what_its_trials_do_is_the_same(storage_uri, changes
             {"agent": {"lr": 1e-3, "gamma": 0.5}},
             "with another configuration: agent.gamma was 0.9, is 0.5",
         ),
-        ({}, {"stack": 4}, "stack was not there, is 4; study.allow_config_changes=true accepts that"),
+        ({}, {"stack": 4}, "stack was not there, is 4; accept that with study.allow_config_changes=true"),
         ({"seeds": (0, 1)}, {}, "study.seeds was [0], is [0, 1]"),
         ({"objectives": {"solved": "maximize"}}, {}, "has other objectives: mean_steps was minimize, is not there"),
         ({"space": Space.read({"agent.tau": {"low": 0.1, "high": 0.2}})}, {}, "searches another space: agent.lr was {"),
