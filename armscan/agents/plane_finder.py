@@ -11,7 +11,6 @@ from armscan.agents.finder_parameters import FinderParameters
 from armscan.agents.protocols import AgentSetup
 from armscan.agents.tianshou_imports import import_tianshou
 from armscan.envs.actions import COMPONENTS, STOP
-from armscan.envs.history import MEMORY
 from armscan.errors import InvalidValueError
 
 if TYPE_CHECKING:
@@ -71,8 +70,6 @@ class PlaneFinder(FinderParameters):
 def check_observed(space: spaces.Space[Any], n_looks: int) -> None:
     """Raise `InvalidValueError` unless observations are stacks of images and actions of `n_looks` looks."""
     parts = space.spaces if isinstance(space, spaces.Dict) else {}
-    if MEMORY in parts:
-        raise InvalidValueError("agent is plane_finder, which takes no best actions: take memory=0")
     for part, choice in PARTS.items():
         if part not in parts:
             raise InvalidValueError(f"agent is plane_finder, but the observation has no part {part!r}: take {choice}")

@@ -117,8 +117,8 @@ PIXEL_TISSUES = Tissues(
     PixelTissue(label=3, eps_px=1.1, min_samples=4),
 )
 
-# Finds what the pixel mode finds at its own spacing, and the same at any other with pixels of up to about 0.55 mm. From
-# 0.6 mm on, the artery's pixels have no neighbours.
+# Finds what the pixel mode finds at its own spacing, and the same at any other with pixels of up to about 0.55 mm. In
+# larger ones than 0.6 mm, the artery's have no neighbours.
 MAX_METRIC_PIXEL_MM = 0.6
 METRIC_TISSUES = Tissues(
     MetricTissue(label=1, eps_mm=1.6, density=0.94),

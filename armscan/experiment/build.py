@@ -171,10 +171,17 @@ def check_each_seen(key: str, n_episodes: int, part: str, split: Split) -> None:
         raise InvalidValueError(f"{key} is {n_episodes}, but it must be {least}")
 
 
-def check_network(config: DictConfig, overrides: Sequence[str]) -> None:
-    """Raise `InvalidValueError` if overrides choose the network of a plane finder, which has one of its own."""
-    given = next((each for each in overrides if re.match(r"[+~]*network[=.]", each)), None)
-    if given and type(make_algorithm(config)) is PlaneFinder:
+def check_effects(config: DictConfig, overrides: Sequence[str]) -> None:
+    """Check that a new run's overrides have an effect: a plane finder has its own network, and takes no memory.
+
+    Raises:
+        InvalidValueError: If one has none.
+    """
+    if type(make_algorithm(config)) is not PlaneFinder:
+        return
+    if config.env.memory:
+        raise InvalidValueError(f"memory is {config.env.memory}, but agent=plane_finder takes no best actions: give 0")
+    if given := next((each for each in overrides if re.match(r"[+~]*network[=.]", each)), None):
         raise InvalidValueError(
             f"{given!r} has no effect: agent=plane_finder has a network of its own, with agent.filters and "
             "agent.hidden_sizes"

@@ -12,7 +12,7 @@ from omegaconf import DictConfig
 
 from armscan.agents import Learner
 from armscan.config.command_hints import armscan_command, resume_command
-from armscan.experiment.build import Experiment, check_episodes, check_keys, check_network, set_up
+from armscan.experiment.build import Experiment, check_effects, check_episodes, check_keys, set_up
 from armscan.experiment.console import print_result_table, print_where_to_look
 from armscan.experiment.job import Invocation
 from armscan.experiment.provenance import start_tracking
@@ -56,7 +56,7 @@ def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict
         The metrics of the final evaluations, by the name of their volumes.
     """
     check_keys(config)
-    check_network(config, invocation.overrides)
+    check_effects(config, invocation.overrides)
     job = invocation.job
     told = log_compilation(COMPILING, lambda dispatcher: dispatcher.py_func.__module__.startswith(OF_ENVIRONMENT))
     with folder_lock(invocation.folder):

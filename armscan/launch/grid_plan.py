@@ -56,7 +56,7 @@ def check_grid(words: Sequence[str]) -> None:
         return
     print("preparing a grid: its words are checked first", flush=True)
     # Deferred: it takes time, so the line above comes first.
-    from armscan.experiment.build import check_config, check_network
+    from armscan.experiment.build import check_config, check_effects
 
     errors = []
     _, jobs = jobs_of(overrides)
@@ -64,7 +64,7 @@ def check_grid(words: Sequence[str]) -> None:
         config = compose(job)
         try:
             check_config(config)
-            check_network(config, job)
+            check_effects(config, job)
         except (ArmscanError, HydraException, OmegaConfBaseException) as error:
             errors.append(error)
         else:

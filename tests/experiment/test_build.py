@@ -8,7 +8,7 @@ import pytest
 from armscan.config.compose import compose
 from armscan.envs import SliceObservation
 from armscan.errors import InvalidValueError
-from armscan.experiment.build import build_experiment, check_network, set_up
+from armscan.experiment.build import build_experiment, check_effects, set_up
 from armscan.training import Split
 
 
@@ -92,8 +92,10 @@ def test_section_that_builds_something_else_is_refused(phantom, monkeypatch, sec
 
 
 @pytest.mark.parametrize("override", ["network=mlp", "network.vector.hidden_sizes=[8]"])
-def test_network_of_an_agent_that_has_its_own_is_refused(override):
+def test_network_and_memory_without_effect_are_refused(override):
     for agent in ("residual_sac", "exhaustive", "sac"):
-        check_network(compose([f"agent={agent}", override]), [override])
+        check_effects(compose([f"agent={agent}", override, "memory=2"]), [override])
     with pytest.raises(InvalidValueError, match=r"'network.*' has no effect: agent=plane_finder has"):
-        check_network(compose(["agent=plane_finder", override]), ["agent=plane_finder", override])
+        check_effects(compose(["agent=plane_finder", override]), ["agent=plane_finder", override])
+    with pytest.raises(InvalidValueError, match="memory is 2, but agent=plane_finder takes no best actions"):
+        check_effects(compose(["agent=plane_finder", "memory=2"]), [])

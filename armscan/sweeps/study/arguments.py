@@ -17,7 +17,7 @@ from armscan.config.compose import compose, of_run
 from armscan.config.defaults import MULTIRUN, NOT_SEARCHED, PLAN, RESUME
 from armscan.config.sources import SWEEP
 from armscan.errors import InvalidValueError
-from armscan.experiment.build import check_config, check_network
+from armscan.experiment.build import check_config, check_effects
 from armscan.launch.launchers import LAUNCHER
 
 STUDY = "study"
@@ -85,7 +85,7 @@ def check_training_overrides(arguments: Sequence[str]) -> None:
     if OmegaConf.select(config, TASK_TARGET) == TRAINING_TASK:
         of_trainings = of_run(config)[0]
         check_config(of_trainings)
-        check_network(of_trainings, overrides)
+        check_effects(of_trainings, overrides)
 
 
 def fixed_by(overrides: Sequence[str]) -> dict[str, Any]:
