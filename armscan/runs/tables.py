@@ -111,18 +111,8 @@ def narrow_table(*headings: str) -> Table:
 COLUMNS = (
     *("run_id", "name", "status", "experiment_id", "parent", "started", "duration_s"),
     *("on_plane_rate", "on_plane_mm", "on_plane_deg", "success_rate", "mean_steps"),
-    *(
-        "size_bytes",
-        "folder_bytes",
-        "artifact_bytes",
-        "below",
-        "agent",
-        "obs",
-        "projection",
-        "folder",
-        "host",
-        "best_run",
-    ),
+    *("size_bytes", "folder_bytes", "artifact_bytes", "below"),
+    *("agent", "obs", "projection", "folder", "host", "best_run"),
 )
 
 
