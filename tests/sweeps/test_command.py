@@ -137,7 +137,7 @@ def test_study_runs_its_trials_judges_the_best_and_goes_on_when_it_is_asked_for_
     assert again.returncode == 0, again.stderr
     assert [trial.state.name for trial in trials_of(tmp_path)] == ["COMPLETE"] * 3
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(StudyError, match=r"validation_episodes was 2, is 3; study\.allow_config_changes=true"):
+    with pytest.raises(StudyError, match=r"validation_episodes was 2, is 3; accept that with study\.allow_config"):
         run_study([*TINY, "study.n_trials=4", "training.validation_episodes=3"], launch=pytest.fail)
     assert len(trials_of(tmp_path)) == 3
 
