@@ -117,7 +117,7 @@ def _check_one_place(path: Path, steps: Sequence[float], place: Sequence[float])
         steps: The sign of the qform's third axis, then the spacing.
         place: Quaternion (b, c, d) and offset of the qform, then the rows of the sform.
     """
-    # Deferred: scipy takes long to import, and few files have both.
+    # Deferred: phantoms, and volumes in the cache, need no scipy.
     from scipy.spatial.transform import Rotation
 
     b, c, d, *offset = place[:6]
