@@ -18,6 +18,7 @@ from armscan.cli.options import (
     trust_option,
 )
 from armscan.errors import InvalidValueError
+from armscan.stats.on_plane import ON_PLANE_KEY
 from armscan.utils.validation import MAX_SEED
 
 if TYPE_CHECKING:
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     from armscan.evaluation.volumes import VolumesByName
 
 N_EPISODES, N_VIDEO_EPISODES = 200, 3
-ON_PLANE_KEY = "evaluation.on_plane"
 # Overrides of `armscan run` that are options here.
 OPTIONS = {
     "agent": "--agent NAME",

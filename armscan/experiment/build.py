@@ -23,17 +23,9 @@ from armscan.config.trust import needs_trust
 from armscan.envs import EnvFactory
 from armscan.errors import InvalidValueError, listed
 from armscan.experiment.agent import make_agent, make_algorithm
+from armscan.stats.on_plane import ON_PLANE, ON_PLANE_KEY, OnPlane, check_on_plane
 from armscan.tracking import check_settings
-from armscan.training import (
-    ON_PLANE,
-    Budget,
-    CheckpointProvenance,
-    Fingerprints,
-    OnPlane,
-    Split,
-    TrainingDomain,
-    check_on_plane,
-)
+from armscan.training import Budget, CheckpointProvenance, Fingerprints, Split, TrainingDomain
 from armscan.training.domain import smallest_slice, with_crops
 from armscan.training.episode_results import Env
 from armscan.utils.log import silence_libraries
@@ -209,7 +201,7 @@ def check_config(config: DictConfig) -> None:
 def on_plane_of(config: DictConfig) -> tuple[OnPlane, ...]:
     """Return the limits within which a plane counts as the labelled one; the default limits for older runs."""
     node = config.evaluation.get("on_plane", ON_PLANE)
-    return check_on_plane("evaluation.on_plane", OmegaConf.to_container(node) if OmegaConf.is_config(node) else node)
+    return check_on_plane(ON_PLANE_KEY, OmegaConf.to_container(node) if OmegaConf.is_config(node) else node)
 
 
 def apply_crop(config: DictConfig, trained_px: tuple[int, int], here_px: tuple[int, int]) -> DictConfig:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from mlflow.entities import Metric, Run, RunTag
+from mlflow.entities import Metric, Param, Run, RunTag
 
 from armscan.config.defaults import FOLD
-from armscan.stats.on_plane import leading_of
+from armscan.stats.on_plane import ON_PLANE_KEY, leading_of
 from armscan.tracking import TrackingStore
 from armscan.tracking.outbox import now_ms
 from armscan.tracking.tags import BEST_TAG
@@ -16,6 +16,8 @@ from armscan.training.episode_results import TEST_METRICS
 from armscan.training.metric_display import leading_among
 
 TESTED = f"{TEST_METRICS}/"
+# Jobs that differ in one of these have different tasks or test volumes, so that none of them is the best.
+OF_TASK = ("projection", "data.path", FOLD)
 
 
 def best_of(runs: Sequence[Run]) -> Run | None:
@@ -32,14 +34,18 @@ def best_of(runs: Sequence[Run]) -> Run | None:
 
 
 def show_best(store: TrackingStore, parent_id: str, jobs: Sequence[Run]) -> None:
-    """Log the leading figures of the best job and its random agent to the run of a grid, under the same names.
+    """Log the leading figures of the best job, its random agent and their limits to a grid's run, by the same names.
 
-    Jobs of different folds have different test volumes, so none of them is the best.
+    If jobs have different tasks or test volumes, only the limits.
     """
-    if (best := best_of(jobs)) is None or len({job.data.params.get(FOLD) for job in jobs}) > 1:
+    if (best := best_of(jobs)) is None:
+        return
+    limits = [Param(name, value) for name, value in best.data.params.items() if name == ON_PLANE_KEY]
+    if len({tuple(job.data.params.get(key) for key in OF_TASK) for job in jobs}) > 1:
+        store.log_batch(parent_id, params=limits)
         return
     now, metrics = now_ms(), []
     for group in (TESTED, f"{RANDOM}/"):
         found = {name.removeprefix(group): value for name, value in best.data.metrics.items() if name.startswith(group)}
         metrics += [Metric(f"{group}{name}", found[name], now, 0) for name in leading_among(found)]
-    store.log_batch(parent_id, metrics=metrics, tags=[RunTag(BEST_TAG, best.info.run_id)])
+    store.log_batch(parent_id, metrics=metrics, params=limits, tags=[RunTag(BEST_TAG, best.info.run_id)])

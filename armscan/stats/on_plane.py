@@ -12,6 +12,8 @@ from armscan.utils.validation import check_numbers
 
 EXPECTED = "a list of different pairs [mm, degrees], each above 0, such as [[5, 10], [2, 5]]"
 PREFIX = "on_plane_"
+# Key of the limits in a configuration.
+ON_PLANE_KEY = "evaluation.on_plane"
 
 
 class OnPlane(NamedTuple):
@@ -71,6 +73,6 @@ def check_on_plane(name: str, limits: object) -> tuple[OnPlane, ...]:
 def leading_of(params: Mapping[str, str]) -> OnPlane:
     """Return the leading limits that a run's MLflow parameters name; the default limits for older runs."""
     try:
-        return check_on_plane("evaluation.on_plane", json.loads(params["evaluation.on_plane"]))[0]
+        return check_on_plane(ON_PLANE_KEY, json.loads(params[ON_PLANE_KEY]))[0]
     except (KeyError, ValueError):
         return ON_PLANE[0]

@@ -7,6 +7,7 @@ import pytest
 from mlflow.entities import Metric, Param
 
 from armscan.launch.best_job import show_best
+from armscan.stats.on_plane import leading_of
 from armscan.tracking import TrackedRun
 from armscan.tracking.tags import BEST_TAG
 from armscan.tracking.uploader import set_description
@@ -71,13 +72,25 @@ def test_run_of_a_grid_shows_the_figures_of_its_best_job(store):
     assert run.data.tags[BEST_TAG] == jobs[1]
 
 
-def test_run_of_a_cross_validation_shows_no_best_fold(store):
+@pytest.mark.parametrize("key", ["data.fold", "projection", "data.path"])
+def test_run_of_a_grid_over_tasks_shows_no_best_job(store, key):
     client, experiment_id = store()
     parent, *jobs = (client.create_run(experiment_id, name=name, tags={}).info.run_id for name in ("parent", "a", "b"))
-    for fold, job in enumerate(jobs):
-        client.log_batch(job, metrics=[Metric(RATE, 0.5, 1, 5)], params=[Param("data.fold", str(fold))])
+    for number, job in enumerate(jobs):
+        client.log_batch(job, metrics=[Metric(RATE, 0.5, 1, 5)], params=[Param(key, str(number))])
     show_best(client, parent, [client.get_run(job) for job in jobs])
     assert client.get_run(parent).data.metrics == {}
+
+
+@pytest.mark.parametrize("projections", [("y", "y"), ("y", "zy")])
+def test_run_of_a_grid_has_the_limits_of_its_jobs(store, projections):
+    client, experiment_id = store()
+    parent, *jobs = (client.create_run(experiment_id, name=name, tags={}).info.run_id for name in ("parent", "a", "b"))
+    for job, projection in zip(jobs, projections, strict=True):
+        params = [Param("evaluation.on_plane", "[[2, 5]]"), Param("projection", projection)]
+        client.log_batch(job, metrics=[Metric("test_volumes/on_plane_2mm_5deg", 0.5, 1, 5)], params=params)
+    show_best(client, parent, [client.get_run(job) for job in jobs])
+    assert leading_of(client.get_run(parent).data.params) == (2, 5)
 
 
 def test_run_of_a_grid_without_evaluated_jobs_shows_nothing(store):
