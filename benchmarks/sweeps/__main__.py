@@ -7,7 +7,7 @@
     python -m benchmarks.sweeps idle [folder=FOLDER] [trials=60] [shortest_s=1] [longest_s=5]
                                         share of worker time spent in trials, armscan alone with short trials
     python -m benchmarks.sweeps beside [folder=FOLDER] [trials=10]
-                                        what a study adds to a training of a minute
+                                        what a study adds to a training
     python -m benchmarks.sweeps kill [folder=FOLDER] [trials=200] [every_s=20] [storage=journal]
                                         trials finished although workers are killed, and the storage
                                         (journal, sqlite or postgresql) is unavailable twice

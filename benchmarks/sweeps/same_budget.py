@@ -42,7 +42,7 @@ from benchmarks.sweeps.searches import NAME, WITHOUT_END, SearchResult, search_b
 
 
 class Task(NamedTuple):
-    """A sweep, the number of seeds of its trials, and the processor seconds of a search: some 30 whole trainings."""
+    """A sweep, the number of seeds of its trials, and the processor seconds of a search: some 20 whole trainings."""
 
     words: tuple[str, ...]
     n_seeds: int
@@ -199,9 +199,9 @@ def _column(rows: Sequence[Row], task: str) -> Mapping[str, str]:
         ),
         "trials: Hydra": mean(HYDRA, "n_trials"),
         "mean steps: default, armscan, Hydra": ", ".join(f"{each.mean():.3f}" for each in scores.values()),
-        "armscan less Hydra": less(ARMSCAN, HYDRA),
-        "armscan less default": less(ARMSCAN, DEFAULT),
-        "Hydra less default": less(HYDRA, DEFAULT),
+        "armscan minus Hydra": less(ARMSCAN, HYDRA),
+        "armscan minus default": less(ARMSCAN, DEFAULT),
+        "Hydra minus default": less(HYDRA, DEFAULT),
         "replicates in which armscan is better, equal, worse": ", ".join(
             str((signs == sign).sum()) for sign in (-1, 0, 1)
         ),

@@ -117,7 +117,7 @@ def test_both_are_judged_with_the_same_seeds_and_volumes(trained, tmp_path):
     assert scores["armscan"] == pytest.approx(np.array([[2.0, 3.0], [2.0, 3.0]]))
     assert scores["hydra"] - scores["armscan"] == pytest.approx(np.ones((2, 2)))
     assert scores["default"] - scores["armscan"] == pytest.approx(np.full((2, 2), 3.0))
-    assert "| armscan less Hydra | -1.000 (-1.000 to -1.000) | -1.000 (-1.000 to -1.000) |" in table(rows)
+    assert "| armscan minus Hydra | -1.000 (-1.000 to -1.000) | -1.000 (-1.000 to -1.000) |" in table(rows)
     assert {seed for name, seed in trained if name == "a"} == {seed for name, seed in trained if name == "b"}
 
 

@@ -64,7 +64,7 @@ def test_each_is_started_when_those_that_it_needs_answer(compose):
 
 def test_workers_can_be_many(compose):
     worker = compose["services"]["worker"]
-    # Only one worker could have a given name, host name or port; by their host names workers know each other.
+    # Only one worker could have a given name, host name or port.
     assert {"container_name", "hostname", "network_mode", "ports"} & worker.keys() == set()
     assert "study.workers=1" in worker["command"].split()
     assert int(worker["stop_grace_period"].removesuffix("s")) >= 15
