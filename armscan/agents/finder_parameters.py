@@ -91,7 +91,8 @@ class FinderParameters:
     def __post_init__(self) -> None:
         check_numbers_of(self)
         for name, n_sizes in (("filters", N_CONVOLUTIONS), ("hidden_sizes", None)):
-            check_ints(f"agent.{name}", getattr(self, name), n_sizes, "", at_least=1, at_most=MAX_LAYER_UNITS)
+            sizes = getattr(self, name)
+            check_ints(f"agent.{name}", sizes, n_sizes, "", min_length=1, at_least=1, at_most=MAX_LAYER_UNITS)
         n_offsets = len(self.offsets_mm) if isinstance(self.offsets_mm, list | tuple) else 0
         offsets = check_numbers("agent.offsets_mm", self.offsets_mm, max(n_offsets, 1), "in mm, one for each look")
         if not 2 <= n_offsets <= MAX_LOOKS or offsets[-1] != 0.0 or max(map(abs, offsets)) > MAX_OFFSET_MM:

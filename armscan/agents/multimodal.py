@@ -35,7 +35,7 @@ class Multimodal:
         head_sizes: Units of each hidden layer of the head.
 
     Raises:
-        InvalidValueError: If a size is not a whole number of at least 1.
+        InvalidValueError: If there is no size, or one is not a whole number of at least 1.
     """
 
     def __init__(
@@ -46,7 +46,7 @@ class Multimodal:
     ) -> None:
         self.filters = list(check_ints("network.filters", filters, 3, "for the convolutions", at_least=1, at_most=4096))
         self.vector_sizes, self.head_sizes = (
-            list(check_ints(f"network.{name}", sizes, None, "", at_least=1, at_most=MAX_UNITS))
+            list(check_ints(f"network.{name}", sizes, None, "", min_length=1, at_least=1, at_most=MAX_UNITS))
             for name, sizes in (("vector_sizes", vector_sizes), ("head_sizes", head_sizes))
         )
 

@@ -50,7 +50,7 @@ class PlaneFinder(FinderParameters):
         """Raise `InvalidValueError` if the environment or the budget of the training does not fit."""
         if setup.action_names[: len(COMPONENTS)] != COMPONENTS:
             raise InvalidValueError(
-                f"agent is plane_finder, which moves all of {', '.join(COMPONENTS)}, but projection leaves "
+                f"agent is a plane finder, which moves all of {', '.join(COMPONENTS)}, but projection leaves "
                 f"{', '.join(setup.action_names)} free: take projection=full, or experiment=plane_finder, which sets "
                 "all that it needs"
             )
@@ -72,11 +72,11 @@ def check_observed(space: spaces.Space[Any], n_looks: int) -> None:
     parts = space.spaces if isinstance(space, spaces.Dict) else {}
     for part, choice in PARTS.items():
         if part not in parts:
-            raise InvalidValueError(f"agent is plane_finder, but the observation has no part {part!r}: take {choice}")
+            raise InvalidValueError(f"agent is a plane finder, but the observation has no part {part!r}: take {choice}")
         shape = parts[part].shape or ()
         n_stacked = shape[0] if len(shape) == (4 if part == "shares" else 2) else 1
         if n_stacked != n_looks:
             raise InvalidValueError(
-                f"agent is plane_finder with {n_looks} looks (agent.offsets_mm), but {n_stacked} are stacked in the "
+                f"agent is a plane finder with {n_looks} looks (agent.offsets_mm), but {n_stacked} are stacked in the "
                 f"observation's part {part!r}: take stack={n_looks} and stack_exclude=[]"
             )

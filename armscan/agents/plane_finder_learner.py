@@ -179,7 +179,7 @@ class PlaneFinderLearner(SupervisedLearner):
         given, known = (*bounds.rotation_deg, *bounds.translation_mm), self._module.geometry.bounds.tolist()
         if not np.allclose(given, known, atol=1e-3):
             raise InvalidValueError(
-                f"the bounds of the actions are {given}, but agent=plane_finder has learned with {tuple(known)}: give "
+                f"the bounds of the actions are {given}, but this plane finder has learned with {tuple(known)}: give "
                 "them with env.rotation_bounds_deg and env.translation_bounds_mm"
             )
 

@@ -132,7 +132,7 @@ def common_geometry(rules: Rules, n_looks: int) -> PlaneGeometry:
     """
     if rules.ends == ON_REWARD or rules.max_steps < n_looks:
         raise InvalidValueError(
-            f"env.ends is {rules.ends!r} and env.max_steps is {rules.max_steps}, but agent=plane_finder looks beside "
+            f"env.ends is {rules.ends!r} and env.max_steps is {rules.max_steps}, but a plane finder looks beside "
             f"the plane, {n_looks} times: take env.ends=on_budget or on_stop, and at least "
             f"env.max_steps={n_looks}"
         )
@@ -140,7 +140,7 @@ def common_geometry(rules: Rules, n_looks: int) -> PlaneGeometry:
     if len(bounds) > 1:
         sizes = listed(" x ".join(f"{mm:g}" for mm in each.translation_mm) for each in bounds)
         raise InvalidValueError(
-            f"the bounds of translations are {sizes} mm, but agent=plane_finder needs the same on all volumes: give "
+            f"the bounds of translations are {sizes} mm, but a plane finder needs the same on all volumes: give "
             "env.translation_bounds_mm"
         )
     middles = np.array([volume.slice_centre_mm for volume in rules.volumes.values()])

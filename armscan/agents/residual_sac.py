@@ -64,7 +64,10 @@ class ResidualSAC(PlaneFinder):
                 f"agent.pretraining_env_steps is {self.pretraining_env_steps}, but it must be below "
                 f"training.env_steps = {setup.total_env_steps}, which leaves the rest to SAC"
             )
-        self.check(replace(setup, total_env_steps=self.pretraining_env_steps))
+        try:
+            self.check(replace(setup, total_env_steps=self.pretraining_env_steps))
+        except InvalidValueError as error:
+            raise InvalidValueError(str(error).replace("training.env_steps", "agent.pretraining_env_steps")) from error
         import_tianshou()
         from armscan.agents.residual_learner import ResidualLearner
 

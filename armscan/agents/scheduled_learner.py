@@ -35,6 +35,7 @@ class ScheduledLearner:
     def __init__(self, first: Learner, later: Sequence[tuple[int, Learner]]) -> None:
         self._use(first)
         self._later = list(later)
+        self._has_learned = False
 
     def _use(self, learner: Learner) -> None:
         self._learner, self._batch = learner, batch_agent(learner)
@@ -54,6 +55,12 @@ class ScheduledLearner:
         """See `Learner.update_note`."""
         return self._learner.update_note
 
+    @property
+    def schedule_note(self) -> str | None:
+        """Return which changes no epoch has applied yet, for the log; None if there are none, or it has not learned."""
+        unused = " or ".join(str(start) for start, _ in self._later if self._has_learned)
+        return f"no epoch began at or after {unused} environment steps: no such change was made" if unused else None
+
     def __getattr__(self, name: str) -> Any:
         """Return an optional attribute of the current learner."""
         if name in OPTIONAL:
@@ -72,6 +79,7 @@ class ScheduledLearner:
         if due is not None:
             due.load_state(self._learner.state())
             self._use(due)
+        self._has_learned = True
         return self._learner.learn(n_env_steps)
 
     def begin(self, *, seed: int, bounds: ActionBounds) -> None:

@@ -71,7 +71,10 @@ def one_line_message(error: BaseException) -> str | None:
 
 
 def _named(message: str, section: str) -> str:
-    """Return a message whose keys `agent.` name the nested section that they were read from, such as `agent.sac.`."""
+    """Return a message whose keys name the section that they were read from, `agent.sac.` or `network.vector.`."""
+    _, of_network, part = section.partition("network.")
+    if of_network:
+        return message.replace(of_network, f"{of_network}{part}.")
     return message.replace("agent.", f"{section}.") if section.startswith("agent.") else message
 
 

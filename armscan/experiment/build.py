@@ -164,15 +164,17 @@ def check_each_seen(key: str, n_episodes: int, part: str, split: Split) -> None:
 
 
 def check_effects(config: DictConfig, overrides: Sequence[str]) -> None:
-    """Check that a new run's overrides have an effect: a plane finder has its own network, and takes no memory.
+    """Check that a new run's settings have an effect: plane finders take no memory, `plane_finder` has its own network.
 
     Raises:
         InvalidValueError: If one has none.
     """
-    if type(make_algorithm(config)) is not PlaneFinder:
+    if not isinstance(algorithm := make_algorithm(config), PlaneFinder):
         return
     if config.env.memory:
-        raise InvalidValueError(f"memory is {config.env.memory}, but agent=plane_finder takes no best actions: give 0")
+        raise InvalidValueError(f"memory is {config.env.memory}, but a plane finder takes no best actions: give 0")
+    if type(algorithm) is not PlaneFinder:
+        return
     if given := next((each for each in overrides if re.match(r"[+~]*network[=.]", each)), None):
         raise InvalidValueError(
             f"{given!r} has no effect: agent=plane_finder has a network of its own, with agent.filters and "

@@ -170,7 +170,7 @@ def train_agent(
         seed=seed,
         on_plane=setup.on_plane,
     )
-    return train(
+    result = train(
         agent,
         budget,
         validate,
@@ -180,6 +180,10 @@ def train_agent(
         earlier=earlier,
         until_env_steps=until_env_steps,
     )
+    has_ended = not result.is_solved and agent.n_env_steps >= budget.env_steps
+    if has_ended and (note := getattr(agent, "schedule_note", None)):
+        tell(f"training.schedule: {note}")
+    return result
 
 
 def keep_results(tracked: TrackedRun, result: TrainingResult | None, reached: RunResult, folder: Path) -> None:

@@ -64,8 +64,11 @@ def check_on_plane(name: str, limits: object) -> tuple[OnPlane, ...]:
     """
     if not isinstance(limits, Sequence) or isinstance(limits, str) or not limits:
         raise InvalidValueError(f"{name} is {limits!r}, but it must be {EXPECTED}")
-    pairs = [OnPlane(*check_numbers(name, pair, 2, "(mm, degrees) each")) for pair in limits]
-    if min(min(pair) for pair in pairs) <= 0.0 or len({pair.metric for pair in pairs}) < len(pairs):
+    try:
+        pairs = [OnPlane(*check_numbers(name, pair, 2, "(mm, degrees) each")) for pair in limits]
+    except InvalidValueError:
+        pairs = []
+    if not pairs or min(min(pair) for pair in pairs) <= 0.0 or len({pair.metric for pair in pairs}) < len(pairs):
         raise InvalidValueError(f"{name} is {limits!r}, but it must be {EXPECTED}")
     return tuple(pairs)
 

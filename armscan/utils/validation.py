@@ -76,7 +76,9 @@ def check_numbers(name: str, value: Any, length: int, meaning: str) -> tuple[flo
     return tuple(float(number) for number in value)
 
 
-def check_ints(name: str, value: Any, length: int | None, meaning: str, **bounds: int) -> tuple[int, ...]:
+def check_ints(
+    name: str, value: Any, length: int | None, meaning: str, *, min_length: int = 0, **bounds: int
+) -> tuple[int, ...]:
     """Return `value` as a tuple of `length` whole numbers, or of any number of them if `length` is None.
 
     Args:
@@ -84,11 +86,12 @@ def check_ints(name: str, value: Any, length: int | None, meaning: str, **bounds
         value: Sequence to check; text and bytes are refused.
         length: Required number of values.
         meaning: Meaning of the values, such as '(across, depth)'.
+        min_length: Smallest number of values, if `length` is None. Default: 0.
         **bounds: Bounds of each value; see `check_int`.
     """
     is_sequence = isinstance(value, Sequence) and not isinstance(value, str | bytes | bytearray | memoryview)
-    if not is_sequence or (length is not None and len(value) != length):
-        wanted = "a list of" if length is None else str(length)
+    if not is_sequence or len(value) < min_length or (length is not None and len(value) != length):
+        wanted = f"a list of{' 1 or more' if min_length else ''}" if length is None else str(length)
         raise InvalidValueError(f"{name} is {value!r}, but it must be {wanted} whole numbers{meaning and ' '}{meaning}")
     return tuple(check_int(f"each of {name}", number, **bounds) for number in value)
 

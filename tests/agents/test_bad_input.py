@@ -5,7 +5,8 @@ from dataclasses import fields
 import pytest
 from hypothesis import given
 
-from armscan.agents import MLP, SAC, Exhaustive, OptunaSearch, PlaneFinder, Regression
+from armscan.agents import MLP, SAC, Exhaustive, Multimodal, OptunaSearch, PlaneFinder, Regression
+from armscan.errors import InvalidValueError
 from tests.support.junk import SETTINGS, is_answered, junk, result_of
 
 
@@ -34,3 +35,11 @@ def test_mlp_with_junk(value):
     assert is_answered(lambda: MLP(value))
     assert is_answered(lambda: MLP([value]))
     assert result_of(lambda: MLP(activation=value)) is None
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"), [(PlaneFinder, "hidden_sizes"), (Multimodal, "vector_sizes"), (Multimodal, "head_sizes")]
+)
+def test_network_that_needs_a_layer_refuses_none(kind, name):
+    with pytest.raises(InvalidValueError, match=rf"{name} is \[\], but it must be a list of 1 or more whole numbers"):
+        kind(**{name: []})

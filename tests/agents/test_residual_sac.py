@@ -178,3 +178,10 @@ def test_what_sac_refuses_is_named_by_its_keys(phantom):
     with pytest.raises(InstantiationException) as refused:
         make_algorithm(compose(["experiment=few_wrists_sac", "agent.sac.lr=-1"]))
     assert one_line_message(refused.value).startswith("agent.sac.lr is -1, but")
+
+
+def test_pretraining_that_is_too_short_is_named_by_its_key(phantom):
+    with pytest.raises(
+        InvalidValueError, match=r"before the first gradient step, but agent\.pretraining_env_steps is 2$"
+    ):
+        made(phantom, pretraining_env_steps=2)

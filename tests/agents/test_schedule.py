@@ -64,6 +64,15 @@ def test_learner_with_a_schedule_has_the_notes_of_its_learner(make_scheduled):
         assert getattr(scheduled, note, None) == getattr(learner, note, None)
 
 
+def test_learner_with_a_schedule_says_which_changes_it_has_not_made(make_scheduled):
+    scheduled = make_scheduled()
+    assert scheduled.schedule_note is None
+    learned(scheduled, 60)
+    assert scheduled.schedule_note == "no epoch began at or after 60 environment steps: no such change was made"
+    learned(scheduled, 80)
+    assert scheduled.schedule_note is None
+
+
 @pytest.mark.parametrize("resumed_at", [20, 40, 60, 80])
 def test_learner_with_a_schedule_goes_on_from_any_epoch_bit_for_bit(make_scheduled, resumed_at):
     whole, first, second = (make_scheduled() for _ in range(3))

@@ -16,3 +16,10 @@ def test_message_from_a_nested_section_names_its_keys(section, key):
     error = InstantiationException(f"Error in call to target\nfull_key: {section}")
     error.__cause__ = InvalidValueError("agent.lr is 0")
     assert one_line_message(error) == f"{key} is 0"
+
+
+@pytest.mark.parametrize("part", ["vector", "images"])
+def test_message_from_a_part_of_the_network_names_its_keys(part):
+    error = InstantiationException(f"Error in call to target\nfull_key: agent.network.{part}")
+    error.__cause__ = InvalidValueError("network.filters is 0")
+    assert one_line_message(error) == f"network.{part}.filters is 0"

@@ -3,6 +3,7 @@
 import html.parser
 import io
 import math
+import re
 
 import numpy as np
 import pytest
@@ -87,9 +88,13 @@ def test_on_plane_limits_are_those_that_are_asked_for_and_name_their_rates():
     assert [column.title for column in table.quantities][:2] == ["on plane, 3 mm 7.5°", "distance mm, median"]
 
 
-@pytest.mark.parametrize("limits", [[], None, "5", [[5]], [[5, 0]], [[-1, 5]], [[5, 10], [5.0, 10.0]], [["a", 1]]])
+@pytest.mark.parametrize(
+    "limits", [[], None, "5", [[5]], [[5, 0]], [[-1, 5]], [5, 10], [[5, 10], [5.0, 10.0]], [["a", 1]]]
+)
 def test_limits_that_are_none_are_refused(limits):
-    with pytest.raises(InvalidValueError, match=r"^evaluation\.on_plane is "):
+    with pytest.raises(
+        InvalidValueError, match=rf"^evaluation\.on_plane is {re.escape(repr(limits))}, but it must be a list"
+    ):
         check_on_plane("evaluation.on_plane", limits)
 
 
