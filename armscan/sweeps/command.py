@@ -65,10 +65,11 @@ def run_study(arguments: Sequence[str], launch: Callable[[Sequence[str]], object
             print_sentence(printable(each.message))
     if reopen(search.study, search.storage, settings.asked):
         print(f"{settings.name}: had ended by itself, going on")
+    blocked = [] if opened.final_eval is None else [study.study_name for study in opened.final_eval.blocked()]
     for phase in opened.phases:
         if phase.scheduler.resume():
             print(f"{phase.name}: was stopped, resuming")
-        if n_failed := phase.scheduler.reset_failures():
+        if n_failed := phase.scheduler.reset_failures(is_blocked=phase.name in blocked):
             print(f"{phase.name}: {n_failed} failures before this start are ignored")
     try:
         run_workers(opened, given, launcher, launch)

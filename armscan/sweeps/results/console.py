@@ -95,8 +95,7 @@ def _print_final_results(opened: OpenedStudy, final: FinalEvaluation) -> int:
     unfinished = os.EX_TEMPFAIL
     for phase in opened.finals:
         check_trials(phase.scheduler.study, n_searched=len(trials))
-        failed = phase.scheduler.state().failed
-        if failed:
+        if failed := phase.scheduler.failures(phase.scheduler.state()):
             unfinished, reason = 1, failed[0].user_attrs.get(FAILURE)
             print(printable(f"error: {len(failed)} trainings of {phase.name} have failed: {reason}"), file=sys.stderr)
     candidates = candidates_of(final)

@@ -109,6 +109,7 @@ class Judgement:
         settings: Overrides of the chosen one and the control, by their names; an empty string without any.
         n_unjudged: Number of trainings that have not ended. Default: 0.
         have_others_failed: Whether a training of every other candidate failed in the race. Default: False.
+        violated_by_control: Constraints of the study that the control violates. Default: none.
     """
 
     chosen: int
@@ -120,6 +121,7 @@ class Judgement:
     settings: Mapping[str, str]
     n_unjudged: int = 0
     have_others_failed: bool = False
+    violated_by_control: tuple[str, ...] = ()
 
     @property
     def notes(self) -> list[str]:
@@ -127,6 +129,8 @@ class Judgement:
         notes = []
         if self.n_seeds < self.n_planned:
             notes.append(f"only {self.n_seeds} of {self.n_planned} seeds have been trained to their end")
+        if violated := " and ".join(self.violated_by_control):
+            notes.append(f"the control violates {violated}, so it could not be chosen")
         if names := ", ".join(map(name_of, self.others)):
             notes.append(f"the test volumes were opened before for {names}: the study went on after its end")
         return [*notes, *(volume_notes(self.results[0].figures) if self.results else ())]
@@ -186,14 +190,14 @@ def judge(final: FinalEvaluation) -> Judgement | None:
     race = final.race()
     if (chosen := race.chosen) is None:
         return None
-    complete = final.judgement.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-    judged = {training_of(trial): trial for trial in complete}
+    judged = final.judged()
     both = to_judge(race)
     now = [judged[number, seed] for number in both for seed in final.judge_seeds if (number, seed) in judged]
     seeds = [seed for seed in final.judge_seeds if all((number, seed) in judged for number in both)]
     pairs = [[judged[number, seed] for seed in seeds] for number in both]
     differences = _differences(final.search, *pairs) if seeds and chosen != CONTROL else ()
-    others = sorted({number for number, _ in judged} - set(both))
+    complete = final.judgement.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+    others = sorted({training_of(trial)[0] for trial in complete} - set(both))
     results, searched = tuple(final_results(now)), final.search.get_trials(deepcopy=False)
     of_others = [standing for number, standing in race.standings.items() if number != CONTROL]
     return Judgement(
@@ -205,6 +209,7 @@ def judge(final: FinalEvaluation) -> Judgement | None:
         others=tuple(others),
         settings={name_of(each.number): " ".join(overrides_of(settings_of(searched, each.number))) for each in results},
         n_unjudged=final.n_unjudged,
+        violated_by_control=tuple(final.violated_by_control()),
         have_others_failed=bool(of_others) and all(standing.has_failed for standing in of_others),
     )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Sequence
 
 from optuna.trial import FrozenTrial
 from pydantic import Field
@@ -49,9 +49,8 @@ class Limits(Section):
             return f"the {self.max_env_steps} environment steps of study.max_env_steps are taken"
         return None
 
-    def failure_reason(self, state: StudyState, reset: Collection[int]) -> str | None:
-        """Return why failures end the study, ignoring trials with the numbers `reset`; None if they do not."""
-        failed = [trial for trial in state.failed if trial.number not in reset]
+    def failure_reason(self, state: StudyState, failed: Sequence[FrozenTrial]) -> str | None:
+        """Return why failed trials end the study; None if they do not."""
         if len(failed) > self.max_failures:
             return f"{len(failed)} trials have failed, and at most {self.max_failures} may: {_reason(failed[-1])}"
         # Final trainings never report, so their environment steps count, too.

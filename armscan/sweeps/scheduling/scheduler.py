@@ -32,10 +32,11 @@ from armscan.sweeps.storage.attribute_names import (
     RETRY_OF,
     STOP,
 )
+from armscan.sweeps.storage.reports import reports_of, store_report
 from armscan.sweeps.storage.storage import Storage
 
-# Optuna's system attribute of an enqueued trial: its values.
-FIXED_PARAMS = "fixed_params"
+# Optuna's system attributes: the values of an enqueued trial, and the prefix of those that its halving pruners write.
+FIXED_PARAMS, RUNG = "fixed_params", "completed_rung_"
 Plan = Callable[[], Sequence[PlannedTrial]]
 
 
@@ -145,8 +146,7 @@ class TrialScheduler:
 
     def failure_reason(self, state: StudyState) -> str | None:
         """See `Limits.failure_reason`; failures before the last restart are ignored."""
-        reset = self.study.user_attrs.get(RESET_FAILURES, ()) if state.failed else ()
-        return self.limits.failure_reason(state, reset)
+        return self.limits.failure_reason(state, self.failures(state))
 
     def check_termination(self, state: StudyState | None = None) -> None:
         """Check whether the study ends before its last trial; see `Termination.check`."""
@@ -166,17 +166,26 @@ class TrialScheduler:
             self.stopped = ""
         return was_stopped
 
-    def reset_failures(self) -> int:
-        """Ignore the failures so far if they have ended the study, because it is started again.
+    def failures(self, state: StudyState) -> list[FrozenTrial]:
+        """Return the failed trials that are not ignored."""
+        reset = self.study.user_attrs.get(RESET_FAILURES, ()) if state.failed else ()
+        return [trial for trial in state.failed if trial.number not in reset]
+
+    def reset_failures(self, *, is_blocked: bool = False) -> int:
+        """Ignore the failures so far if they have ended the study, or block it, because it is started again.
+
+        Args:
+            is_blocked: Whether the study cannot go on with them. Default: False.
 
         Returns:
-            The number of ignored failures; 0 if they have not ended it.
+            The number of failures that are ignored from now on.
         """
         state = self.state()
-        if self.failure_reason(state) is None:
+        failures = self.failures(state)
+        if not failures or not (is_blocked or self.failure_reason(state)):
             return 0
         self.study.set_user_attr(RESET_FAILURES, [trial.number for trial in state.failed])
-        return len(state.failed)
+        return len(failures)
 
     def requeue(self, trial: Trial, lease: Mapping[str, Any], writes: PendingWrites | None = None) -> None:
         """Requeue a worker's own trial, with its lease and pending writes, for any worker to resume."""
@@ -262,6 +271,17 @@ class TrialScheduler:
                 # With the values that it was enqueued with: its worker may have died before it sampled them.
                 params = {**trial.system_attrs.get(FIXED_PARAMS, {}), **trial.params}
                 self.study.enqueue_trial(renamed(params), user_attrs=of_retry)
+                self._copy_reports(trial)
         for name, value in attributes.items():
             self.study._storage.set_trial_user_attr(trial._trial_id, name, value)
         self.study._storage.set_trial_state_values(trial._trial_id, TrialState.FAIL)
+
+    def _copy_reports(self, trial: FrozenTrial) -> None:
+        """Copy the reports of a trial to its retry, which does not repeat the seeds that had finished."""
+        retry = next(each for each in self.state().waiting if each.user_attrs.get(RETRY_OF) == trial.number)
+        storage, trial_id = self.study._storage, retry._trial_id
+        for step, values in reports_of(trial).items():
+            store_report(storage, trial_id, step, values)
+        for name, value in trial.system_attrs.items():
+            if name.startswith(RUNG):
+                storage.set_trial_system_attr(trial_id, name, value)

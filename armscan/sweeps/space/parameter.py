@@ -123,7 +123,7 @@ class Parameter:
             suggest: Any = trial.suggest_int if isinstance(drawn, IntDistribution) else trial.suggest_float
             number: float = suggest(self.name, drawn.low, drawn.high, log=drawn.log, step=drawn.step)
         except (ValueError, TypeError) as error:
-            raise InvalidValueError(f"{refused}: {reason_of(error)}") from error
+            raise InvalidValueError(f"{refused}, or study.sampler has failed: {reason_of(error)}") from error
         # Optuna accepts any value of an enqueued trial, and warns.
         if type(number) not in (int, float) or not drawn._contains(number):
             raise InvalidValueError(f"{refused}: {number!r}")

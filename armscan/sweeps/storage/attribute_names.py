@@ -20,13 +20,16 @@ EARLIER_SPANS = "earlier_spans"
 RUN, FOLDER, CONFIG_SHA256 = "mlflow_run", "folder", "config_sha256"
 # Of an initial trial: the study and number of the trial it was taken from, or the origin of its settings.
 TAKEN_FROM, ENQUEUED_FROM = "taken_from", "enqueued_from"
-# Of a final training: the trial whose configuration is trained, and the seed.
-FINALIST, FINAL_SEED = "judged", "judged_seed"
+# Of a final training: the trial whose configuration is trained, the seed, and the SHA-256 of the study's configuration.
+FINALIST, FINAL_SEED, OF_CONFIG = "judged", "judged_seed", "study_config_sha256"
 # Of a member of a population: its number, its generation, the environment steps at which that begins and ends, the
 # trial whose checkpoint it begins from, and all values since the first generation, in the form of `training.schedule`.
 MEMBER, GENERATION, INTERVAL, PARENT, SCHEDULE = "member", "generation", "interval", "parent", "schedule"
 # What a retry takes over from the attempt before.
-KEPT_BY_RETRY = (SEEDS, FINALIST, FINAL_SEED, STOP, ENQUEUED_FROM, MEMBER, GENERATION, INTERVAL, PARENT, SCHEDULE)
+KEPT_BY_RETRY = (
+    *(SEEDS, FINALIST, FINAL_SEED, OF_CONFIG, STOP, ENQUEUED_FROM),
+    *(MEMBER, GENERATION, INTERVAL, PARENT, SCHEDULE),
+)
 
 # In a lease: the worker that holds the trial.
 HOLDER = ("worker", "host", "pid", "started", "boot", "pid_namespace")

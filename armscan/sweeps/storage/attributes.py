@@ -108,6 +108,7 @@ class TrialAttributes(_Attributes):
     mlflow_run: Text = ""
     folder: Text = ""
     config_sha256: Text = ""
+    study_config_sha256: Text = ""
 
 
 def check_trials(study: optuna.Study, *, n_searched: int | None = None) -> None:

@@ -6,9 +6,11 @@ control are evaluated on the test volumes, with other seeds.
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from statistics import fmean
 from typing import Any, Self
 
 import optuna
@@ -23,9 +25,19 @@ from armscan.sweeps.scheduling.population import searched_values
 from armscan.sweeps.scheduling.race import MAX_SEEDS_FACTOR, Race, Scores, budget, race
 from armscan.sweeps.scheduling.state import CONTROL
 from armscan.sweeps.space.parameter import Value
-from armscan.sweeps.storage.attribute_names import FINAL_SEED, FINALIST, RESET_FAILURES, RETRIED, SCHEDULE
+from armscan.sweeps.storage.attribute_names import (
+    FINAL_SEED,
+    FINALIST,
+    FIXED,
+    METRICS,
+    OF_CONFIG,
+    RESET_FAILURES,
+    RETRIED,
+    SCHEDULE,
+)
 from armscan.sweeps.storage.attributes import FINAL_SUFFIXES, JUDGEMENT_SUFFIX, SELECTION_SUFFIX, check_trials
 from armscan.sweeps.storage.storage import Storage
+from armscan.sweeps.study.constraints import Constraint
 from armscan.sweeps.study.settings import (
     JUDGEMENT_SEEDS_ABOVE,
     MAX_SEARCH_SEED,
@@ -34,6 +46,7 @@ from armscan.sweeps.study.settings import (
     StudySettings,
 )
 from armscan.sweeps.study.study import best_trials
+from armscan.utils.files import sha256
 from armscan.utils.section import Section
 
 # User attribute of the study of the selection: its settings, for reports.
@@ -153,7 +166,7 @@ class FinalEvaluation:
     def scores(self) -> dict[int, dict[int, float]]:
         """Return the score of each ended training of the selection, by candidate and seed; NaN if it failed."""
         scores: dict[int, dict[int, float]] = {number: {} for number in self.candidates()}
-        for trial in _counted_trials(self.selection):
+        for trial in self._counted_trials(self.selection):
             number, seed = training_of(trial)
             if number not in scores:
                 continue
@@ -164,13 +177,30 @@ class FinalEvaluation:
         return scores
 
     def race(self, scores: Scores | None = None) -> Race:
-        """Return the state of the selection's race.
+        """Return the state of the selection's race; a control that violates a constraint is not chosen.
 
         Args:
             scores: Result of `scores`. Default: None, the current scores.
         """
         scores, settings = self.scores() if scores is None else scores, self.settings
-        return race(scores, self.selection_seeds, min_seeds=settings.min_seeds, mean_seeds=settings.mean_seeds)
+        found = race(scores, self.selection_seeds, min_seeds=settings.min_seeds, mean_seeds=settings.mean_seeds)
+        if found.chosen == CONTROL and self.violated_by_control():
+            return replace(found, chosen=found.best_without(CONTROL))
+        return found
+
+    def violated_by_control(self) -> list[str]:
+        """Return the constraints of the study that the control violates, on average over its trainings of the race."""
+        metrics = [
+            trial.user_attrs.get(METRICS, {})
+            for trial in self._counted_trials(self.selection)
+            if trial.state == TrialState.COMPLETE and training_of(trial)[0] == CONTROL
+        ]
+        constraints = map(Constraint.read, self.search.user_attrs.get(FIXED, {}).get("study.constraints", ()))
+        return [
+            str(each)
+            for each in constraints
+            if metrics and each.violation({each.metric: fmean(of.get(each.metric, math.nan) for of in metrics)}) > 0
+        ]
 
     def missing_of_selection(self) -> list[PlannedTrial]:
         """Return the trainings that the selection needs next and no worker has begun."""
@@ -194,19 +224,52 @@ class FinalEvaluation:
         """Number of trainings of the judgement, as far as they are known, that have not ended."""
         ended = {
             training_of(trial)
-            for trial in _counted_trials(self.judgement)
+            for trial in self._counted_trials(self.judgement)
             if trial.state.is_finished() and RETRIED not in trial.user_attrs
         }
         return len({(number, seed) for number in to_judge(self.race()) for seed in self.judge_seeds} - ended)
 
+    def judged(self) -> dict[tuple[int, int], FrozenTrial]:
+        """Return the complete trainings of the judgement, by configuration and seed."""
+        counted = self._counted_trials(self.judgement)
+        return {training_of(trial): trial for trial in counted if trial.state == TrialState.COMPLETE}
+
+    def blocked(self) -> list[optuna.Study]:
+        """Return its studies that cannot end, or lack a seed, because trainings have failed."""
+        race, found = self.race(), []
+        if race.is_over and race.chosen is None:
+            found.append(self.selection)
+        wanted = {(number, seed) for number in to_judge(race) for seed in self.judge_seeds}
+        trials = [trial for trial in self._counted_trials(self.judgement) if training_of(trial) in wanted]
+        if any(trial.state in ENDED_WITHOUT_SCORE and RETRIED not in trial.user_attrs for trial in trials):
+            found.append(self.judgement)
+        return found
+
     def _planned(self, trainings: Iterable[tuple[int, int]], study: optuna.Study) -> list[PlannedTrial]:
-        begun = set(map(training_of, _counted_trials(study)))
-        searched = self.search.get_trials(deepcopy=False)
+        begun = set(map(training_of, self._counted_trials(study)))
+        searched, of_config = self.search.get_trials(deepcopy=False), self._config_sha256()
         return [
-            PlannedTrial(settings_of(searched, number), _attributes(searched, number, seed))
+            PlannedTrial(settings_of(searched, number), _attributes(searched, number, seed) | {OF_CONFIG: of_config})
             for number, seed in trainings
             if (number, seed) not in begun
         ]
+
+    def _counted_trials(self, study: optuna.Study) -> list[FrozenTrial]:
+        """Return the trials of a study that count.
+
+        Not those of an earlier configuration of the study, nor failed ones that are ignored since its last start: both
+        are run again.
+        """
+        ignored, of_config = study.user_attrs.get(RESET_FAILURES, ()), self._config_sha256()
+        return [
+            trial
+            for trial in study.get_trials(deepcopy=False)
+            if trial.number not in ignored and trial.user_attrs.get(OF_CONFIG, of_config) == of_config
+        ]
+
+    def _config_sha256(self) -> str:
+        """Return the checksum of the study's configuration without the searched values."""
+        return sha256(json.dumps(self.search.user_attrs.get(FIXED), sort_keys=True).encode())
 
 
 def to_judge(race: Race) -> list[int]:
@@ -217,12 +280,6 @@ def to_judge(race: Race) -> list[int]:
     if race.chosen is None:
         return [] if race.is_over else [CONTROL]
     return list(dict.fromkeys((race.chosen, CONTROL)))
-
-
-def _counted_trials(study: optuna.Study) -> list[FrozenTrial]:
-    """Return the trials of a study, except failed ones that are ignored since its last start and are run again."""
-    ignored = study.user_attrs.get(RESET_FAILURES, ())
-    return [trial for trial in study.get_trials(deepcopy=False) if trial.number not in ignored]
 
 
 def training_of(trial: FrozenTrial | Trial) -> tuple[int, int]:

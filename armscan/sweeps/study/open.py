@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 from collections.abc import Mapping, Sequence
@@ -12,6 +13,7 @@ import optuna
 from omegaconf import DictConfig
 
 from armscan.config.defaults import to_plain
+from armscan.errors import StudyError
 from armscan.sweeps.scheduling.limits import Limits
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
 from armscan.sweeps.scheduling.termination import Termination
@@ -32,6 +34,8 @@ from armscan.tracking.tags import STORAGE_TAG, STUDY_TAG, TRIAL_TAG
 from armscan.utils.retry import RETRY_S
 
 NO_END = 10**9
+# In the folder of a study: its name.
+OWNER_FILE = "study_name"
 
 
 def open_for_work(
@@ -61,6 +65,7 @@ def open_for_work(
     client, experiment_id = open_store(**to_plain(config.tracking), retry_s=retry_s)
     for folder in (settings.folder, settings.artifacts):
         Path(folder).mkdir(parents=True, exist_ok=True)
+    _own(Path(settings.folder), settings.name)
     storage = open_storage(settings.storage, retry=retry)
     study = make_study(storage, settings, fixed_config(config, overrides, volumes))
     objectives = tuple(settings.objectives)
@@ -89,6 +94,16 @@ def open_for_work(
         final_eval = FinalEvaluation.opened(storage, settings, study, None if misfit else control)
     finals = _final_phases(search, settings, task, final_eval) if final_eval is not None else ()
     return OpenedStudy(settings=settings, config=config, search=search, final_eval=final_eval, finals=finals)
+
+
+def _own(folder: Path, name: str) -> None:
+    """Write the name of a study into its folder; raise `StudyError` if another study's files are there."""
+    file = folder / OWNER_FILE
+    with contextlib.suppress(FileExistsError), file.open("x") as opened:
+        opened.write(name)
+    # Empty while another process of this study writes it.
+    if (owner := file.read_text().strip()) not in ("", name):
+        raise StudyError(f"study.folder is {str(folder)!r}, which has the files of the study {owner}: name another")
 
 
 def _tracked_run(

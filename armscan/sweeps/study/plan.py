@@ -21,7 +21,7 @@ from armscan.sweeps.scheduling.race import budget, round_size
 from armscan.sweeps.scheduling.state import StudyState, seconds_of
 from armscan.sweeps.scheduling.termination import ended_because
 from armscan.sweeps.space.parameter import Parameter
-from armscan.sweeps.study.final_eval import FinalEvaluation, n_trainings, to_judge, training_of
+from armscan.sweeps.study.final_eval import FinalEvaluation, n_trainings, to_judge
 from armscan.sweeps.study.settings import FinalEvalSettings, StudySettings
 from armscan.sweeps.study.warm_start import InitialTrials
 from armscan.utils.console import WHOLE_CHARS, wide_console
@@ -86,7 +86,9 @@ def _print_cost(
     spent_mib = sum(map(_size_bytes, Path(settings.folder).rglob("*"))) / BYTES_A_MIB
     # Final trainings are never pruned.
     whole_s = [spent_s for trial, spent_s in timed if trial.state == TrialState.COMPLETE]
-    training_s = fmean(whole_s or seconds) / len(settings.seeds)
+    # Those of a population train all generations, of which a trial is one.
+    n_generations = settings.n_trials / settings.sampler["population"] if "population" in settings.sampler else 1
+    training_s = fmean(whole_s or seconds) * n_generations / len(settings.seeds)
     least, most = hours_left(settings, final, n_left=n_left, trial_s=mean_s, training_s=training_s)
     console.print(
         f"cost       {sum(seconds) / 3600:.2f} hours of workers, {state.busy_hours:.2f} hours in all, "
@@ -143,9 +145,9 @@ def final_trainings_left(settings: StudySettings, final: FinalEvaluation | None,
     if final is None or n_left:
         return fewest, most
     final = replace(final, settings=settings.final_eval)
-    race, complete = final.race(), final.judgement.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+    race = final.race()
     wanted = {(number, seed) for number in to_judge(race) for seed in final.judge_seeds}
-    n_judged = len(wanted & set(map(training_of, complete)))
+    n_judged = len(wanted & final.judged().keys())
     if race.is_over:
         return len(wanted) - n_judged, len(wanted) - n_judged
     asked = settings.final_eval

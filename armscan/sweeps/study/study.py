@@ -30,6 +30,7 @@ from armscan.tracking import flatten
 N_SHOWN = 5
 # Among the compared settings: the size and interval of a population, the overrides below a searched group, and a
 # checksum of the volumes. A study that lacks one, as those of earlier versions do, is not compared by it.
+CONSTRAINTS = "study.constraints"
 LATER = POPULATION, OVERRIDES, VOLUMES = "study.population", "study.overrides", "study.volumes"
 
 
@@ -117,7 +118,7 @@ def comparable_settings(settings: StudySettings, fixed: Mapping[str, Any]) -> di
     given, sampler = fixed.get(STUDY, {}), settings.sampler
     of_trials: dict[str, Any] = {"study.seeds": list(settings.seeds), "study.task": settings.task["_target_"]}
     if settings.constraints:
-        of_trials["study.constraints"] = list(map(str, settings.constraints))
+        of_trials[CONSTRAINTS] = list(map(str, settings.constraints))
     is_population = "interval_env_steps" in sampler
     of_trials[POPULATION] = [sampler.get("population"), sampler["interval_env_steps"]] if is_population else None
     # A trial chooses all other keys of a searched group.
@@ -176,7 +177,13 @@ def _check_same(settings: StudySettings, study: optuna.Study, wanted: Mapping[st
     # The values of its trials are in this order.
     if [*there[OBJECTIVES]] != [*wanted[OBJECTIVES]]:
         raise StudyError(f"{whose} has its objectives in another order: {', '.join(there[OBJECTIVES])}{other}")
-    differences = _differences(*fixed_of(study, wanted))
+    before, now = fixed_of(study, wanted)
+    if differences := _differences(*({key: each.get(key)} for key in (CONSTRAINTS,) for each in (before, now))):
+        # Whether a trial keeps them was stored when it finished.
+        raise StudyError(
+            f"{whose} has other constraints: {differences}{other}, with study.warm_start=[{settings.name}]"
+        )
+    differences = _differences(before, now)
     if differences and not settings.allow_config_changes:
         raise StudyError(
             f"{whose} was started with another configuration: {differences}; accept that with "
@@ -194,14 +201,14 @@ def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
 def best_trials(study: optuna.Study, n_best: int) -> list[FrozenTrial]:
     """Return the best trials of a study, each with different values, the best first.
 
-    Trials that violate a constraint are left out, and in a population all but the latest generation. With several
+    Trials that violate a constraint are left out, and in a population all but each member's latest. With several
     objectives these are the trials on the Pareto front, ordered by the first objective.
     """
     several = len(study.directions) > 1
     trials = study.best_trials if several else study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-    trials = list(filter(is_feasible, trials))
-    latest = max((trial.user_attrs.get(GENERATION, 0) for trial in trials), default=0)
-    trials = [trial for trial in trials if trial.user_attrs.get(GENERATION, 0) == latest]
+    by_generation = sorted(trials, key=lambda trial: trial.user_attrs.get(GENERATION, 0))
+    latest = {trial.user_attrs[MEMBER]: trial for trial in by_generation if MEMBER in trial.user_attrs}
+    trials = list(filter(is_feasible, latest.values() or trials))
     is_down = study.directions[0] == optuna.study.StudyDirection.MINIMIZE
     ranked = sorted(trials, key=lambda trial: (trial.values[0] if is_down else -trial.values[0], trial.number))
     different: dict[str, FrozenTrial] = {}

@@ -19,7 +19,7 @@ from optuna.trial import Trial
 from armscan.errors import InvalidValueError, listed
 from armscan.sweeps.scheduling.claim import PendingWrites
 from armscan.sweeps.scheduling.state import retried_by
-from armscan.sweeps.storage.attribute_names import ENV_STEPS, EPISODES, INTERVAL, PARENT, RUN, SEEDS
+from armscan.sweeps.storage.attribute_names import ENV_STEPS, EPISODES, INTERVAL, PARENT, RETRY_OF, RUN, SEEDS
 from armscan.sweeps.storage.reports import reports_of, store_report
 from armscan.tracking import TrackedRun
 from armscan.training import Evaluation, Split
@@ -66,13 +66,13 @@ class Attempt:
     transaction: Callable[[Callable[[], bool]], bool]
     env_steps: int = field(init=False)
     _of_seeds: dict[str, Mapping[str, float]] = field(init=False)
-    # Steps that have been reported, including those before the trial was requeued.
+    # Steps that have been reported, including those before the trial was requeued or retried.
     _reported: set[int] = field(init=False)
 
     def __post_init__(self) -> None:
         self._of_seeds = dict(self.trial.user_attrs.get(SEEDS, {}))
         self.env_steps = sum(int(one.get(ENV_STEPS, 0)) for one in self._of_seeds.values())
-        is_resumed = RUN in self.trial.user_attrs
+        is_resumed = self.trial.user_attrs.keys() & {RUN, RETRY_OF}
         self._reported = set(reports_of(self.trial.storage.get_trial(self.trial._trial_id))) if is_resumed else set()
 
     @property

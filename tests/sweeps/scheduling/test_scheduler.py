@@ -26,6 +26,7 @@ from armscan.sweeps.storage.attribute_names import (
     STOP,
     TAKEN_FROM,
 )
+from armscan.sweeps.storage.reports import reports_of, store_report
 from armscan.sweeps.workers import heartbeat as lease_module
 from armscan.sweeps.workers.heartbeat import Heartbeat, LivenessCheck
 from armscan.utils.processes import ProcessInfo, process_start
@@ -127,6 +128,21 @@ def test_trial_whose_worker_died_while_it_took_it_is_reclaimed_at_once(make_sche
     scheduler = make_scheduler()
     scheduler.study.ask()
     assert [trial.number for trial in scheduler.reclaim(lambda _: False)] == [0]
+
+
+def test_retry_has_the_reports_and_rungs_of_the_attempt_before(make_scheduler):
+    scheduler = make_scheduler(max_retries=1)
+    trial = scheduler.claim({"worker": "a"})
+    storage = scheduler.study._storage
+    for step in (400, 800):
+        store_report(storage, trial._trial_id, step, [step / 100.0])
+    storage.set_trial_system_attr(trial._trial_id, "completed_rung_0", 4.0)
+    scheduler.reclaim(lambda _: True)
+    again = scheduler.claim({"worker": "b"})
+    stored = storage.get_trial(again._trial_id)
+    assert stored.user_attrs[RETRY_OF] == trial.number
+    assert reports_of(stored) == {400: (4.0,), 800: (8.0,)}
+    assert stored.system_attrs["completed_rung_0"] == 4.0
 
 
 def test_death_between_a_retry_and_the_failure_makes_no_second_retry(make_scheduler, monkeypatch):

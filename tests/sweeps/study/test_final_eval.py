@@ -41,15 +41,17 @@ def storage_uri(tmp_path):
     return str(tmp_path / "a.journal")
 
 
-def searched(uri, objectives=("mean_steps",), **changes):
+def searched(uri, objectives=("mean_steps",), fixed=None, constraints=(), **changes):
     """Make a study whose search has ended; return its storage, settings and study."""
     asked = settings(
         storage=uri,
         objectives=dict.fromkeys(objectives, "minimize"),
+        constraints=constraints,
+        allow_config_changes=True,
         final_eval=FinalEvalSettings(**FINAL_EVAL | changes),
     )
     storage = open_storage(uri)
-    search = make_study(storage, asked, {})
+    search = make_study(storage, asked, fixed or {})
     for number, luck in LUCK.items() if not search.trials else ():
         trial = search.ask()
         trial.suggest_float("agent.lr", 1e-4, 1e-2)
@@ -285,8 +287,7 @@ def test_interval_of_a_rate_ends_at_0_and_100_percent(monkeypatch, storage_uri):
 
 
 def test_interval_of_steps_ends_at_the_longest_episode(storage_uri):
-    final = run(storage_uri, true={0: 6.0, 1: 1.2, 2: 5.0, CONTROL: 9.9})
-    final.search.set_user_attr("fixed_config", {"env.max_steps": 10})
+    final = run(storage_uri, true={0: 6.0, 1: 1.2, 2: 5.0, CONTROL: 9.9}, fixed={"env": {"max_steps": 10}})
     highs = [each.estimate.high for each in candidates_of(final) if math.isfinite(each.estimate.low)]
     assert max(highs) == 10
     assert candidates_of(final)[0].estimate.low >= 1.0
@@ -367,16 +368,21 @@ def test_final_evaluation_is_read_from_the_storage_and_that_of_an_earlier_versio
     assert FinalEvaluation.stored(storage, search) is None
 
 
-def test_member_of_the_latest_generation_is_trained_with_its_whole_schedule(storage_uri):
+def test_latest_trial_of_each_member_is_trained_with_its_whole_schedule(storage_uri):
     storage, asked, search = searched(storage_uri)
     schedule = [{"from_env_steps": 0, "agent.lr": 0.001}, {"from_env_steps": 400, "agent.lr": 0.002}]
     search.enqueue_trial({"agent.lr": 0.002}, user_attrs={MEMBER: 0, GENERATION: 1, SCHEDULE: schedule})
     member = search.ask()
     member.suggest_float("agent.lr", 1e-4, 1e-2)
     search.tell(member, 99.0)
+    search.enqueue_trial({"agent.lr": 0.003}, user_attrs={MEMBER: 1, GENERATION: 0, SCHEDULE: schedule[:1]})
+    behind = search.ask()
+    behind.suggest_float("agent.lr", 1e-4, 1e-2)
+    # Its next generation is not complete.
+    search.tell(behind, 98.0)
     final = FinalEvaluation.opened(storage, asked, search, None)
     # Better values of earlier generations are not of whole trainings.
-    assert final.candidates() == [CONTROL, member.number]
+    assert final.candidates() == [CONTROL, behind.number, member.number]
     planned = [each for each in final.missing_of_selection() if each.attributes[FINALIST] == member.number]
     assert len(planned) == FINAL_EVAL["min_seeds"]
     scheduler = TrialScheduler(final.selection, storage, Limits(n_trials=9), lambda: planned)
@@ -408,6 +414,48 @@ def test_trainings_that_failed_before_a_restart_are_run_again(storage_uri):
     assert selection.reset_failures() >= 2
     run(storage_uri)
     assert final.race().chosen == 1
+
+
+@pytest.mark.parametrize("phase", ["selection", "judgement"])
+def test_final_evaluation_that_failed_is_run_again_once_it_is_started_again(storage_uri, phase):
+    final, schedulers = opened(storage_uri)
+    if phase == "judgement":
+        while trial := schedulers[0].claim({}):
+            end(schedulers[0], trial, TRUE)
+    scheduler = dict(zip(("selection", "judgement"), schedulers, strict=True))[phase]
+    assert final.blocked() == []
+    while trial := scheduler.claim({}):
+        # Too few failures to end the study.
+        scheduler.renew(trial, {"env_steps": 100})
+        fail(scheduler, trial, "the disk was full")
+    assert [each.study_name for each in final.blocked()] == [scheduler.study.study_name]
+    n_failed = len(scheduler.state().failed)
+    assert scheduler.reset_failures() == 0
+    assert scheduler.reset_failures(is_blocked=True) == n_failed
+    assert scheduler.failures(scheduler.state()) == []
+    run(storage_uri)
+    assert judge(final).n_seeds == FINAL_EVAL["judge_seeds"]
+    assert final.blocked() == []
+
+
+def test_trainings_of_an_earlier_configuration_of_the_study_are_run_again(storage_uri):
+    first = run(storage_uri)
+    assert judge(first).differences[0].paired.value < -2.5
+    n_before = len(trained(first.judgement))
+    again = run(storage_uri, true=dict.fromkeys(TRUE, 5.0) | {1: 4.9}, fixed={"env": {"max_steps": 40}})
+    assert judge(again).chosen == CONTROL or judge(again).differences[0].paired.value > -1.0
+    assert len(trained(again.judgement)) >= n_before + FINAL_EVAL["judge_seeds"]
+
+
+@pytest.mark.parametrize(("constraint", "is_kept"), [("mean_steps <= 2", False), ("mean_steps <= 9", True)])
+def test_control_that_violates_a_constraint_is_judged_but_not_chosen(storage_uri, constraint, is_kept):
+    final = run(storage_uri, true=TRUE | {CONTROL: 2.5}, constraints=[constraint])
+    assert final.violated_by_control() == ([] if is_kept else [constraint])
+    judgement = judge(final)
+    assert judgement.chosen == (CONTROL if is_kept else 1)
+    told = f"the control violates {constraint}, so it could not be chosen"
+    assert (told in judgement.notes) is not is_kept
+    assert {number for number, _ in trained(final.judgement)} == {CONTROL, judgement.chosen}
 
 
 def test_training_of_the_final_evaluation_cannot_be_stopped_alone(storage_uri):

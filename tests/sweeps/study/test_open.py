@@ -5,10 +5,11 @@ import pytest
 from optuna.trial import TrialState
 from optuna_dashboard import get_note, save_note
 
-from armscan.errors import TrackingError
+from armscan.errors import StudyError, TrackingError
 from armscan.sweeps.storage.attribute_names import NOTE_SUM, STUDY_RUN
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.dashboard import note_run
+from armscan.sweeps.study.open import _own
 
 
 @pytest.mark.parametrize("kind", ["another study's", "a trial's", "of another experiment", "nobody's"])
@@ -111,3 +112,10 @@ def test_study_that_is_damaged_while_it_runs_says_so_in_one_line(opened):
     scheduler.study.tell(trial, state=TrialState.FAIL)
     with pytest.raises(ValueError, match=r"study.user_attrs.forgiven is 3, but it must be a list of numbers"):
         scheduler.failure_reason(scheduler.state())
+
+
+def test_folder_of_another_study_is_refused(tmp_path):
+    _own(tmp_path, "first")
+    _own(tmp_path, "first")
+    with pytest.raises(StudyError, match="has the files of the study first: name another"):
+        _own(tmp_path, "second")

@@ -229,3 +229,12 @@ def test_study_with_another_space_is_refused_before_it_is_opened_although_change
     study = existing_study(storage, settings(allow_config_changes=True), FIXED | {"stack": 4})
     # Only read here: the change is stored when the study is opened.
     assert "stack" not in study.user_attrs["fixed_config"]
+
+
+def test_study_with_other_constraints_is_refused_although_changes_are_allowed(storage_uri):
+    storage = open_storage(storage_uri)
+    make_study(storage, settings(storage=storage_uri), {})
+    storage.study("a").ask()
+    changed = settings(storage=storage_uri, constraints=["training_s <= 60"], allow_config_changes=True)
+    with pytest.raises(StudyError, match=r"has other constraints: .*study\.warm_start=\["):
+        make_study(storage, changed, {})
