@@ -92,12 +92,14 @@ def _print_replay(opened: OpenedStudy) -> None:
 def _print_final_results(opened: OpenedStudy, final: FinalEvaluation) -> int:
     """Print how a configuration was chosen, and its results on the test volumes; return the exit code."""
     trials = opened.search.scheduler.study.get_trials(deepcopy=False)
-    unfinished = os.EX_TEMPFAIL
+    unfinished, blocked = os.EX_TEMPFAIL, [study.study_name for study in final.blocked()]
     for phase in opened.finals:
         check_trials(phase.scheduler.study, n_searched=len(trials))
         if failed := phase.scheduler.failures(phase.scheduler.state()):
             unfinished, reason = 1, failed[0].user_attrs.get(FAILURE)
-            print(printable(f"error: {len(failed)} trainings of {phase.name} have failed: {reason}"), file=sys.stderr)
+            again = "; fix the cause, and the same command trains them again" if phase.name in blocked else ""
+            told = f"error: {len(failed)} trainings of {phase.name} have failed: {reason}{again}"
+            print(printable(told), file=sys.stderr)
     candidates = candidates_of(final)
     if candidates:
         objective = objective_of(final)
