@@ -108,9 +108,8 @@ def _store_of(source: TrainedAgent, store: Mapping[str, Any]) -> tuple[TrackingS
 
 def _html(title: str, report: EvaluationReport, notes: Sequence[str]) -> str:
     """Return the page of an evaluation: its notes, and a table for each split."""
-    shown = "".join(f"<p>{html.escape(note)}</p>" for note in notes)
     tables = "".join(f"<h2>{html.escape(label)}</h2>{table.html()}" for label, table in report.tables().items())
-    return page(title, shown + tables)
+    return page(title, tables, notes=notes)
 
 
 def _check_out(out: Path | None) -> None:

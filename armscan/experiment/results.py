@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -133,9 +132,7 @@ class RunResult:
         for file, evaluations in ((EVALUATION_FILE, self.evaluations), (BASELINES_FILE, self.baselines)):
             contents = {name: evaluation.to_dict() for name, evaluation in evaluations.items()}
             atomic_write(folder / file, json.dumps(contents, indent=1))
-        notes = "".join(f"<p>{html.escape(note)}</p>" for note in self.notes())
-        text = page(title, f"{self.table().html()}{notes}")
-        atomic_write(folder / RESULTS_PAGE, text)
+        atomic_write(folder / RESULTS_PAGE, page(title, self.table().html(), notes=self.notes()))
 
 
 def result_table(figures: Mapping[str, MetricEstimates]) -> ResultTable:

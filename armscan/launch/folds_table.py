@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import json
 import math
 from collections.abc import Iterable, Sequence
@@ -105,8 +104,7 @@ def keep_table(
     from armscan.tracking.uploader import set_description
 
     file = folder / RESULTS_PAGE
-    said = "".join(f"<p>{html.escape(note)}</p>" for note in notes)
-    text = page("all folds (test)", f"{said}{table.html()}<h2>Jobs</h2>{jobs.html()}")
+    text = page("all folds (test)", f"{table.html()}<h2>Jobs</h2>{jobs.html()}", notes=notes)
     atomic_write(file, text)
     time_ms = now_ms()
     groups = {title: metric_prefix(title.removesuffix(ALL_FOLDS)) for title in table.results} | {AGENT: TEST_METRICS}

@@ -135,17 +135,19 @@ def write_page(
     return file
 
 
-def page(title: str, body: str, *, script: str = "", refresh_s: int | None = None) -> str:
+def page(title: str, body: str, *, notes: Sequence[str] = (), script: str = "", refresh_s: int | None = None) -> str:
     """Return a page that needs no server.
 
     Args:
         title: Title and first heading.
         body: Pieces of HTML.
+        notes: Paragraphs of plain text above the body. Default: none.
         script: JavaScript of the page. Default: none.
         refresh_s: Seconds after which a browser reloads the page. Default: None, never.
     """
     head = "" if refresh_s is None else REFRESH.format(refresh_s)
-    return PAGE.format(title=html.escape(title), head=head, script=script, body=body)
+    paragraphs = "".join(f"<p>{html.escape(note)}</p>" for note in notes)
+    return PAGE.format(title=html.escape(title), head=head, script=script, body=paragraphs + body)
 
 
 def _is_report(file: Path) -> bool:
