@@ -257,7 +257,7 @@ def test_run_on_labelmap_files(tmp_path, data_folder):
         (["data=nifti", "data.pth=x"], "there is no key 'pth' in data, but only path, validation, test, split_seed"),
         (["data=nifti"], "data.path is not set"),
         (["data=nifti", "data.path=/nowhere"], "/nowhere: the folder of volumes does not exist"),
-        (["seed=["], "the value of seed cannot be read: [; quote a string as seed=\"'...'\""),
+        (["seed=["], "the value of seed cannot be read: [; quote strings in it: seed=\"['a b']\""),
         (["seed"], "'seed' cannot be read: what follows the options must be key=value"),
         (["foo"], "'foo' cannot be read"),
         (["obs=null"], "Config group override must be a string or a list. Got NoneType"),

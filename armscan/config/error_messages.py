@@ -50,9 +50,10 @@ def one_line_message(error: BaseException) -> str | None:
         case HydraException() if several := re.match("Ambiguous value for argument '(.*?)' 1", text):
             return f"{several[1]!r} gives several values: add -m to try each of them, or write a list as KEY=[A,B]"
         case OverrideParseException():
-            key, is_value, value = str(error.override).partition("=")
-            if is_value and key:
-                return f"the value of {key} cannot be read: {value}; quote a string as {key}=\"'...'\""
+            if given := re.fullmatch(r"([+~]*[\w./@:-]+)=(.*)", str(error.override), re.DOTALL):
+                return (
+                    f"the value of {given[1]} cannot be read: {given[2]}; quote strings in it: {given[1]}=\"['a b']\""
+                )
             return f"{error.override!r} cannot be read: what follows the options must be key=value"
         case MissingMandatoryValue():
             return f"{error.full_key} is not set, but it must be: give {error.full_key}=VALUE"

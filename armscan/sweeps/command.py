@@ -26,6 +26,7 @@ from armscan.sweeps.workers.launch import run_workers
 from armscan.utils.console import print_sentence
 from armscan.utils.log import silence_libraries
 from armscan.utils.processes import n_usable_cores
+from armscan.utils.text import counted
 
 
 def run_study(arguments: Sequence[str], launch: Callable[[Sequence[str]], object]) -> int:
@@ -70,7 +71,7 @@ def run_study(arguments: Sequence[str], launch: Callable[[Sequence[str]], object
         if phase.scheduler.resume():
             print(f"{phase.name}: was stopped, resuming")
         if n_failed := phase.scheduler.reset_failures(is_blocked=phase.name in blocked):
-            print(f"{phase.name}: {n_failed} failures before this start are ignored")
+            print(f"{phase.name}: ignoring {counted(n_failed, 'failure')} before this start")
     try:
         run_workers(opened, given, launcher, launch)
     except KeyboardInterrupt:

@@ -28,6 +28,7 @@ from armscan.sweeps.tasks.attempt import trial_folder
 from armscan.training.metric_display import title_of, value_text
 from armscan.utils.console import WHOLE_CHARS, print_sentence, wide_console
 from armscan.utils.run_files import RUN_FILE
+from armscan.utils.text import counted
 
 
 def print_result(opened: OpenedStudy) -> int:
@@ -98,7 +99,7 @@ def _print_final_results(opened: OpenedStudy, final: FinalEvaluation) -> int:
         if failed := phase.scheduler.failures(phase.scheduler.state()):
             unfinished, reason = 1, failed[0].user_attrs.get(FAILURE)
             again = "; fix the cause, and the same command trains them again" if phase.name in blocked else ""
-            told = f"error: {len(failed)} trainings of {phase.name} have failed: {reason}{again}"
+            told = f"error: {counted(len(failed), 'training')} of {phase.name} failed: {reason}{again}"
             print(printable(told), file=sys.stderr)
     candidates = candidates_of(final)
     if candidates:

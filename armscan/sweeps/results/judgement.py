@@ -84,7 +84,7 @@ class Difference(NamedTuple):
         better = "higher" if self.is_higher_better else "lower"
         return {
             "on the test volumes": f"{title_of(self.metric)} ({better} is better)",
-            "chosen less control": f"{value}{unit}",
+            "chosen minus control": f"{value}{unit}",
             "95 % interval": interval,
             "probability of improvement": formatted(PERCENT, self.probability.value),
             "its 95 % interval": (
@@ -110,6 +110,7 @@ class Judgement:
         n_unjudged: Number of trainings that have not ended. Default: 0.
         have_others_failed: Whether a training of every other candidate failed in the race. Default: False.
         violated_by_control: Constraints of the study that the control violates. Default: none.
+        is_repeated: Whether trainings with an earlier configuration of the study were judged before. Default: False.
     """
 
     chosen: int
@@ -122,6 +123,7 @@ class Judgement:
     n_unjudged: int = 0
     have_others_failed: bool = False
     violated_by_control: tuple[str, ...] = ()
+    is_repeated: bool = False
 
     @property
     def notes(self) -> list[str]:
@@ -130,7 +132,9 @@ class Judgement:
         if self.n_seeds < self.n_planned:
             notes.append(f"only {self.n_seeds} of {self.n_planned} seeds have been trained to their end")
         if violated := " and ".join(self.violated_by_control):
-            notes.append(f"the control violates {violated}, so it could not be chosen")
+            notes.append(f"the control violates {violated}{', so it could not be chosen' * (self.chosen != CONTROL)}")
+        if self.is_repeated:
+            notes.append("the test volumes were opened before, with another configuration of the study")
         if names := ", ".join(map(name_of, self.others)):
             notes.append(f"the test volumes were opened before for {names}: the study went on after its end")
         return [*notes, *(volume_notes(self.results[0].figures) if self.results else ())]
@@ -210,6 +214,7 @@ def judge(final: FinalEvaluation) -> Judgement | None:
         settings={name_of(each.number): " ".join(overrides_of(settings_of(searched, each.number))) for each in results},
         n_unjudged=final.n_unjudged,
         violated_by_control=tuple(final.violated_by_control()),
+        is_repeated=not all(map(final.is_current, complete)),
         have_others_failed=bool(of_others) and all(standing.has_failed for standing in of_others),
     )
 

@@ -87,11 +87,6 @@ class Race:
         left = [each for each in standings if standings[each].n_seeds and not standings[each].has_failed]
         return max(left, key=lambda each: standings[each].estimate.value, default=None)
 
-    def best_without(self, left_out: int) -> int | None:
-        """Return the configuration that would be chosen without another; None if all others have failed."""
-        ranked = {each: of_it.lower_end for each, of_it in self.standings.items() if not of_it.has_failed}
-        return max((each for each in ranked if each != left_out), key=lambda each: ranked[each], default=None)
-
 
 def race(scores: Scores, seeds: Sequence[int], *, min_seeds: int, mean_seeds: int) -> Race:
     """Return the state of a race.

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Mapping, Sequence
+from itertools import filterfalse
 from typing import Any
 
 import optuna
@@ -50,6 +51,8 @@ class TrialScheduler:
         plan: Function that returns the trials to enqueue next, derived from the storage. Default: None, Optuna's
             sampler proposes the trials.
         termination: Ends the study before its last trial. Default: None, nothing does.
+        is_current: Function that returns whether a trial is still wanted; others are not run, and their failures do not
+            count. Default: None, all are.
     """
 
     def __init__(
@@ -60,9 +63,11 @@ class TrialScheduler:
         plan: Plan | None = None,
         *,
         termination: Termination | None = None,
+        is_current: Callable[[FrozenTrial], bool] | None = None,
     ) -> None:
         self.study, self.storage = study, storage
         self.limits, self._plan = limits, plan
+        self._is_current = is_current
         self.termination = termination
         # Who asked the study to stop, as far as this process knows; see `read_stop_request`.
         self.stopped = ""
@@ -87,6 +92,7 @@ class TrialScheduler:
             nonlocal is_repeated
             if outcome is not None:
                 self._tell(outcome, is_repeated=is_repeated)
+            self._drop_waiting()
             state = self.state()
             # If the storage became unavailable midway, a trial may have been claimed, and only the reply lost.
             own = [trial for trial in state.running if is_repeated and trial.user_attrs.get(LEASE) == lease]
@@ -103,6 +109,13 @@ class TrialScheduler:
             return trial
 
         return self.storage.exclusive(claimed)
+
+    def _drop_waiting(self) -> None:
+        """Fail the waiting trials that are not wanted any more; they count nowhere."""
+        # A search reads its trials only once for a claim.
+        for trial in filterfalse(self._is_current, self.state().waiting) if self._is_current else ():
+            self.study._storage.set_trial_user_attr(trial._trial_id, RETRIED, True)
+            self.study._storage.set_trial_state_values(trial._trial_id, TrialState.FAIL)
 
     def _tell(self, outcome: TrialOutcome, *, is_repeated: bool) -> None:
         trial = outcome.trial
@@ -169,7 +182,8 @@ class TrialScheduler:
     def failures(self, state: StudyState) -> list[FrozenTrial]:
         """Return the failed trials that are not ignored."""
         reset = self.study.user_attrs.get(RESET_FAILURES, ()) if state.failed else ()
-        return [trial for trial in state.failed if trial.number not in reset]
+        failed = [trial for trial in state.failed if trial.number not in reset]
+        return [*filter(self._is_current, failed)] if self._is_current else failed
 
     def reset_failures(self, *, is_blocked: bool = False) -> int:
         """Ignore the failures so far if they have ended the study, or block it, because it is started again.
@@ -271,15 +285,17 @@ class TrialScheduler:
                 # With the values that it was enqueued with: its worker may have died before it sampled them.
                 params = {**trial.system_attrs.get(FIXED_PARAMS, {}), **trial.params}
                 self.study.enqueue_trial(renamed(params), user_attrs=of_retry)
-                self._copy_reports(trial)
+            self._copy_reports(trial)
         for name, value in attributes.items():
             self.study._storage.set_trial_user_attr(trial._trial_id, name, value)
         self.study._storage.set_trial_state_values(trial._trial_id, TrialState.FAIL)
 
     def _copy_reports(self, trial: FrozenTrial) -> None:
         """Copy the reports of a trial to its retry, which does not repeat the seeds that had finished."""
-        retry = next(each for each in self.state().waiting if each.user_attrs.get(RETRY_OF) == trial.number)
-        storage, trial_id = self.study._storage, retry._trial_id
+        waiting = self.state().waiting
+        if not (retries := [each for each in waiting if each.user_attrs.get(RETRY_OF) == trial.number]):
+            return
+        storage, trial_id = self.study._storage, retries[0]._trial_id
         for step, values in reports_of(trial).items():
             store_report(storage, trial_id, step, values)
         for name, value in trial.system_attrs.items():

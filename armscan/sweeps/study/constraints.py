@@ -52,7 +52,8 @@ class Constraint:
         return cls(found[1], found[2] == "<=", bound)
 
     def __str__(self) -> str:
-        return f"{self.metric} {'<=' if self.is_upper else '>='} {self.bound:g}"
+        bound = f"{self.bound:g}"
+        return f"{self.metric} {'<=' if self.is_upper else '>='} {bound if float(bound) == self.bound else self.bound}"
 
     def violation(self, metrics: Mapping[str, float]) -> float:
         """Return by how much metrics violate it, relative to the bound: at most 0 if they do not.

@@ -10,6 +10,7 @@ import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from statistics import fmean
 from typing import Any, Self
 
@@ -45,7 +46,7 @@ from armscan.sweeps.study.settings import (
     FinalEvalSettings,
     StudySettings,
 )
-from armscan.sweeps.study.study import best_trials
+from armscan.sweeps.study.study import CONSTRAINTS, best_trials
 from armscan.utils.files import sha256
 from armscan.utils.section import Section
 
@@ -75,6 +76,7 @@ class FinalEvaluation:
         search: The study of the search.
         selection: The study of the trainings that choose a configuration.
         judgement: The study of the trainings that judge it.
+        config_sha256: Checksum of the study's configuration without the searched values, as its trainings have it here.
     """
 
     settings: FinalEvalSettings
@@ -83,6 +85,7 @@ class FinalEvaluation:
     search: optuna.Study
     selection: optuna.Study
     judgement: optuna.Study
+    config_sha256: str
 
     @classmethod
     def opened(
@@ -118,7 +121,9 @@ class FinalEvaluation:
         if selection.user_attrs.get(FINAL_EVAL) != stored:
             selection.set_user_attr(FINAL_EVAL, stored)
         judgement = make(JUDGEMENT_SUFFIX, [StudyDirection.MINIMIZE])
-        return cls(settings.final_eval, max(settings.seeds), control, search, selection, judgement)
+        return cls(
+            settings.final_eval, max(settings.seeds), control, search, selection, judgement, _config_sha256(search)
+        )
 
     @classmethod
     def stored(cls, storage: Storage, search: optuna.Study) -> Self | None:
@@ -136,7 +141,7 @@ class FinalEvaluation:
             # Its race had other rules.
             return None
         kept = _Stored.read(where, found)
-        return cls(kept.settings, kept.search_seed, kept.control, search, selection, judgement)
+        return cls(kept.settings, kept.search_seed, kept.control, search, selection, judgement, _config_sha256(search))
 
     @property
     def selection_seeds(self) -> range:
@@ -177,16 +182,20 @@ class FinalEvaluation:
         return scores
 
     def race(self, scores: Scores | None = None) -> Race:
-        """Return the state of the selection's race; a control that violates a constraint is not chosen.
+        """Return the state of the selection's race, which a control that violates a constraint leaves after one round.
 
         Args:
             scores: Result of `scores`. Default: None, the current scores.
         """
         scores, settings = self.scores() if scores is None else scores, self.settings
-        found = race(scores, self.selection_seeds, min_seeds=settings.min_seeds, mean_seeds=settings.mean_seeds)
-        if found.chosen == CONTROL and self.violated_by_control():
-            return replace(found, chosen=found.best_without(CONTROL))
-        return found
+        run = partial(race, seeds=self.selection_seeds, min_seeds=settings.min_seeds)
+        others = {number: scores[number] for number in scores if number != CONTROL}
+        has_begun = scores.get(CONTROL, {}).keys() >= set(self.selection_seeds[: settings.min_seeds])
+        if others and has_begun and self.violated_by_control():
+            found = run(others, mean_seeds=settings.mean_seeds)
+            alone = run({CONTROL: scores[CONTROL]}, mean_seeds=settings.min_seeds)
+            return replace(found, standings={**alone.standings, **found.standings})
+        return run(scores, mean_seeds=settings.mean_seeds)
 
     def violated_by_control(self) -> list[str]:
         """Return the constraints of the study that the control violates, on average over its trainings of the race."""
@@ -195,7 +204,7 @@ class FinalEvaluation:
             for trial in self._counted_trials(self.selection)
             if trial.state == TrialState.COMPLETE and training_of(trial)[0] == CONTROL
         ]
-        constraints = map(Constraint.read, self.search.user_attrs.get(FIXED, {}).get("study.constraints", ()))
+        constraints = map(Constraint.read, self.search.user_attrs.get(FIXED, {}).get(CONSTRAINTS, ()))
         return [
             str(each)
             for each in constraints
@@ -235,7 +244,7 @@ class FinalEvaluation:
         return {training_of(trial): trial for trial in counted if trial.state == TrialState.COMPLETE}
 
     def blocked(self) -> list[optuna.Study]:
-        """Return its studies that cannot end, or lack a seed, because trainings have failed."""
+        """Return its studies that failed trainings, if any, leave without a choice or a seed of the judgement."""
         race, found = self.race(), []
         if race.is_over and race.chosen is None:
             found.append(self.selection)
@@ -247,12 +256,20 @@ class FinalEvaluation:
 
     def _planned(self, trainings: Iterable[tuple[int, int]], study: optuna.Study) -> list[PlannedTrial]:
         begun = set(map(training_of, self._counted_trials(study)))
-        searched, of_config = self.search.get_trials(deepcopy=False), self._config_sha256()
+        searched = self.search.get_trials(deepcopy=False)
+        # A command with another configuration has taken over the study.
+        if _config_sha256(self.search) != self.config_sha256:
+            return []
+        shared = {OF_CONFIG: self.config_sha256}
         return [
-            PlannedTrial(settings_of(searched, number), _attributes(searched, number, seed) | {OF_CONFIG: of_config})
+            PlannedTrial(settings_of(searched, number), _attributes(searched, number, seed) | shared)
             for number, seed in trainings
             if (number, seed) not in begun
         ]
+
+    def is_current(self, trial: FrozenTrial) -> bool:
+        """Return whether a final training has the study's configuration, as those of earlier versions always do."""
+        return bool(trial.user_attrs.get(OF_CONFIG, self.config_sha256) == self.config_sha256)
 
     def _counted_trials(self, study: optuna.Study) -> list[FrozenTrial]:
         """Return the trials of a study that count.
@@ -260,16 +277,13 @@ class FinalEvaluation:
         Not those of an earlier configuration of the study, nor failed ones that are ignored since its last start: both
         are run again.
         """
-        ignored, of_config = study.user_attrs.get(RESET_FAILURES, ()), self._config_sha256()
-        return [
-            trial
-            for trial in study.get_trials(deepcopy=False)
-            if trial.number not in ignored and trial.user_attrs.get(OF_CONFIG, of_config) == of_config
-        ]
+        ignored = study.user_attrs.get(RESET_FAILURES, ())
+        trials = study.get_trials(deepcopy=False)
+        return [trial for trial in trials if trial.number not in ignored and self.is_current(trial)]
 
-    def _config_sha256(self) -> str:
-        """Return the checksum of the study's configuration without the searched values."""
-        return sha256(json.dumps(self.search.user_attrs.get(FIXED), sort_keys=True).encode())
+
+def _config_sha256(search: optuna.Study) -> str:
+    return sha256(json.dumps(search.user_attrs.get(FIXED), sort_keys=True).encode())
 
 
 def to_judge(race: Race) -> list[int]:

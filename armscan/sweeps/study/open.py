@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
 from collections.abc import Mapping, Sequence
@@ -31,6 +30,7 @@ from armscan.sweeps.study.warm_start import values_of
 from armscan.sweeps.tasks.attempt import Task
 from armscan.tracking import TrackingStore, code_state, open_store, run_of_study
 from armscan.tracking.tags import STORAGE_TAG, STUDY_TAG, TRIAL_TAG
+from armscan.utils.files import atomic_write
 from armscan.utils.retry import RETRY_S
 
 NO_END = 10**9
@@ -65,9 +65,9 @@ def open_for_work(
     client, experiment_id = open_store(**to_plain(config.tracking), retry_s=retry_s)
     for folder in (settings.folder, settings.artifacts):
         Path(folder).mkdir(parents=True, exist_ok=True)
-    _own(Path(settings.folder), settings.name)
     storage = open_storage(settings.storage, retry=retry)
     study = make_study(storage, settings, fixed_config(config, overrides, volumes))
+    _own(Path(settings.folder), study)
     objectives = tuple(settings.objectives)
     population = population_of(settings, config)
     plan = None if population is None else lambda: population.plan(study.get_trials(deepcopy=False))
@@ -96,14 +96,17 @@ def open_for_work(
     return OpenedStudy(settings=settings, config=config, search=search, final_eval=final_eval, finals=finals)
 
 
-def _own(folder: Path, name: str) -> None:
+def _own(folder: Path, study: optuna.Study) -> None:
     """Write the name of a study into its folder; raise `StudyError` if another study's files are there."""
-    file = folder / OWNER_FILE
-    with contextlib.suppress(FileExistsError), file.open("x") as opened:
-        opened.write(name)
-    # Empty while another process of this study writes it.
-    if (owner := file.read_text().strip()) not in ("", name):
-        raise StudyError(f"study.folder is {str(folder)!r}, which has the files of the study {owner}: name another")
+    file, name = folder / OWNER_FILE, study.study_name
+    if not file.exists():
+        # Earlier versions wrote no name.
+        is_known = folder.name == name or not (folder / "trials").exists() or bool(study.get_trials(deepcopy=False))
+        atomic_write(file, name if is_known else "another study")
+    if (owner := file.read_text().strip()) != name:
+        raise StudyError(
+            f"study.folder is {str(folder)!r}, which has the files of {owner}: give study.folder another value"
+        )
 
 
 def _tracked_run(
@@ -161,13 +164,17 @@ def _final_phases(search: Phase, settings: StudySettings, task: Task, final: Fin
     return (
         shared(
             name=final.selection.study_name,
-            scheduler=TrialScheduler(final.selection, storage, limits, final.missing_of_selection),
+            scheduler=TrialScheduler(
+                final.selection, storage, limits, final.missing_of_selection, is_current=final.is_current
+            ),
             run=task.validate,
             folder=search.folder / "selection",
         ),
         shared(
             name=final.judgement.study_name,
-            scheduler=TrialScheduler(final.judgement, storage, limits, final.missing_of_judgement),
+            scheduler=TrialScheduler(
+                final.judgement, storage, limits, final.missing_of_judgement, is_current=final.is_current
+            ),
             objectives=(task.final_metric,),
             run=task.evaluate,
             folder=search.folder / "judged",

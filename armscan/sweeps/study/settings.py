@@ -32,8 +32,8 @@ NO_PRUNER = f"{OPTUNA_PRUNERS}NopPruner"
 
 def check_study_name(where: str, name: Any) -> str:
     """Return the name of a study; raise `InvalidValueError` if it is not a valid one."""
-    if isinstance(name, int | float):
-        raise InvalidValueError(f"{where} is {name!r}, a number, but it must be a string: quote it as \"'{name}'\"")
+    if isinstance(name, int | float) and not isinstance(name, bool):
+        raise InvalidValueError(f"{where} is {name!r}, a number, but it must be a string: begin it with a letter")
     if not isinstance(name, str) or not NAME.fullmatch(name):
         raise InvalidValueError(
             f"{where} is {name!r}, but it must begin with a letter, a digit or _, go on with these, - and ., have at "

@@ -28,9 +28,9 @@ from armscan.sweeps.study.settings import StudySettings
 from armscan.tracking import flatten
 
 N_SHOWN = 5
+CONSTRAINTS = "study.constraints"
 # Among the compared settings: the size and interval of a population, the overrides below a searched group, and a
 # checksum of the volumes. A study that lacks one, as those of earlier versions do, is not compared by it.
-CONSTRAINTS = "study.constraints"
 LATER = POPULATION, OVERRIDES, VOLUMES = "study.population", "study.overrides", "study.volumes"
 
 
@@ -43,8 +43,8 @@ def make_study(storage: Storage, settings: StudySettings, fixed: Mapping[str, An
         fixed: Configuration of its trials without the searched values; see `fixed_config`.
 
     Raises:
-        StudyError: If the study that exists searches another space, has other objectives, or was started with another
-            configuration.
+        StudyError: If the study that exists searches another space, has other objectives or constraints, or was started
+            with another configuration.
     """
     wanted = comparable_settings(settings, fixed)
 
@@ -89,8 +89,8 @@ def existing_study(storage: Storage | None, settings: StudySettings, fixed: Mapp
         fixed: Configuration of its trials without the searched values.
 
     Raises:
-        StudyError: If the study searches another space, has other objectives, or was started with another
-            configuration.
+        StudyError: If the study searches another space, has other objectives or constraints, or was started with
+            another configuration.
     """
     study = storage.study(settings.name) if storage is not None else None
     if study is not None:
@@ -178,11 +178,9 @@ def _check_same(settings: StudySettings, study: optuna.Study, wanted: Mapping[st
     if [*there[OBJECTIVES]] != [*wanted[OBJECTIVES]]:
         raise StudyError(f"{whose} has its objectives in another order: {', '.join(there[OBJECTIVES])}{other}")
     before, now = fixed_of(study, wanted)
-    if differences := _differences(*({key: each.get(key)} for key in (CONSTRAINTS,) for each in (before, now))):
+    if differences := _differences(*({CONSTRAINTS: each.get(CONSTRAINTS, [])} for each in (before, now))):
         # Whether a trial keeps them was stored when it finished.
-        raise StudyError(
-            f"{whose} has other constraints: {differences}{other}, with study.warm_start=[{settings.name}]"
-        )
+        raise StudyError(f"{whose} has other constraints: {differences}{other}")
     differences = _differences(before, now)
     if differences and not settings.allow_config_changes:
         raise StudyError(

@@ -78,3 +78,8 @@ def test_trial_that_violates_a_constraint_is_never_best(storage_uri, directions)
         study.tell(attempt.trial, [value] * len(directions))
     assert [is_feasible(trial) for trial in study.trials] == [False, True, False, False]
     assert [trial.number for trial in best_trials(study, 3)] == [1]
+
+
+@pytest.mark.parametrize("text", ["env_steps <= 1234567", "training_s >= 0.1", "training_s <= 60"])
+def test_constraint_is_written_as_exactly_as_it_is_read(text):
+    assert Constraint.read(str(Constraint.read(text))) == Constraint.read(text)

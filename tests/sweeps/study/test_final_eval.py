@@ -67,7 +67,9 @@ def opened(uri, **changes):
     # A training may lose its worker several times.
     limits = Limits(n_trials=10**9, max_retries=10)
     plans = {final.selection: final.missing_of_selection, final.judgement: final.missing_of_judgement}
-    return final, [TrialScheduler(study, storage, limits, plan) for study, plan in plans.items()]
+    return final, [
+        TrialScheduler(study, storage, limits, plan, is_current=final.is_current) for study, plan in plans.items()
+    ]
 
 
 def steps_of(number, seed, true, rng_of=0):
@@ -445,6 +447,7 @@ def test_trainings_of_an_earlier_configuration_of_the_study_are_run_again(storag
     again = run(storage_uri, true=dict.fromkeys(TRUE, 5.0) | {1: 4.9}, fixed={"env": {"max_steps": 40}})
     assert judge(again).chosen == CONTROL or judge(again).differences[0].paired.value > -1.0
     assert len(trained(again.judgement)) >= n_before + FINAL_EVAL["judge_seeds"]
+    assert "the test volumes were opened before, with another configuration of the study" in judge(again).notes
 
 
 @pytest.mark.parametrize(("constraint", "is_kept"), [("mean_steps <= 2", False), ("mean_steps <= 9", True)])
@@ -456,6 +459,28 @@ def test_control_that_violates_a_constraint_is_judged_but_not_chosen(storage_uri
     told = f"the control violates {constraint}, so it could not be chosen"
     assert (told in judgement.notes) is not is_kept
     assert {number for number, _ in trained(final.judgement)} == {CONTROL, judgement.chosen}
+
+
+def test_control_that_violates_a_constraint_leaves_the_race_after_its_first_round(storage_uri):
+    close = {CONTROL: 1.5, 0: 5.0, 1: 4.9, 2: 9.0}
+    final = run(storage_uri, true=close, constraints=["mean_steps >= 3"], mean_seeds=8)
+    seeds = {number: standing.n_seeds for number, standing in final.race().standings.items()}
+    assert seeds[CONTROL] == FINAL_EVAL["min_seeds"]
+    assert seeds[0] + seeds[1] == 16
+
+
+def test_trainings_of_an_earlier_configuration_neither_run_nor_count_as_failed(storage_uri):
+    _, (_, judgement) = opened(storage_uri)
+    fail(judgement, judgement.claim({"worker": "a"}), "the disk was full")
+    judgement.requeue(trial := judgement.claim({"worker": "a"}), {"worker": "a"})
+    assert judgement.claim({"worker": "b"}).number == trial.number
+    judgement.requeue(trial, {"worker": "b"})
+    final, (_, again) = opened(storage_uri, fixed={"env": {"max_steps": 40}})
+    assert again.failures(again.state()) == []
+    assert again.claim({"worker": "c"}).number > trial.number
+    # The command that has the earlier configuration trains no more.
+    assert judgement.claim({"worker": "a"}) is None
+    assert final.judgement.trials[trial.number].state == TrialState.FAIL
 
 
 def test_training_of_the_final_evaluation_cannot_be_stopped_alone(storage_uri):

@@ -9,7 +9,9 @@ from armscan.errors import StudyError, TrackingError
 from armscan.sweeps.storage.attribute_names import NOTE_SUM, STUDY_RUN
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.dashboard import note_run
-from armscan.sweeps.study.open import _own
+from armscan.sweeps.study.open import OWNER_FILE, _own
+from armscan.sweeps.study.study import make_study
+from tests.sweeps.study.test_study import settings
 
 
 @pytest.mark.parametrize("kind", ["another study's", "a trial's", "of another experiment", "nobody's"])
@@ -114,8 +116,21 @@ def test_study_that_is_damaged_while_it_runs_says_so_in_one_line(opened):
         scheduler.failure_reason(scheduler.state())
 
 
-def test_folder_of_another_study_is_refused(tmp_path):
-    _own(tmp_path, "first")
-    _own(tmp_path, "first")
-    with pytest.raises(StudyError, match="has the files of the study first: name another"):
-        _own(tmp_path, "second")
+def test_folder_of_another_study_is_refused(opened):
+    first = opened(name="a")
+    assert opened(name="a").folder == first.folder
+    other = first.folder.with_name("b")
+    first.folder.rename(other)
+    with pytest.raises(StudyError, match="which has the files of a: give study"):
+        opened(name="b")
+    # Files of an earlier version, which wrote no name.
+    (other / OWNER_FILE).unlink()
+    (other / "trials").mkdir()
+    assert opened(name="b").folder == other
+
+
+def test_folder_that_an_earlier_version_has_given_another_study_is_refused(tmp_path, storage_uri):
+    study = make_study(open_storage(storage_uri), settings(storage=storage_uri), {})
+    (tmp_path / "shared" / "trials").mkdir(parents=True)
+    with pytest.raises(StudyError, match="which has the files of another study"):
+        _own(tmp_path / "shared", study)
