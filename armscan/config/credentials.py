@@ -87,7 +87,7 @@ def database_url(uri: str, variable: str) -> URL:
 
 
 def mask_passwords(text: str) -> str:
-    """Mask passwords in a string, such as a library's error: of addresses, the environment and its files."""
+    """Mask the passwords in a string: those of addresses, of the environment, and of the files that it names."""
     text = ACCOUNT.sub(rf"\1:{MASK}@", text)
     for variable in (STORAGE_PASSWORD, TRACKING_PASSWORD, *SERVER_SECRETS, PGPASSWORD):
         # Of a file that cannot be read, nobody has the password.

@@ -136,7 +136,7 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
     """Close the parent run and print the outcomes of the jobs.
 
     Args:
-        is_interrupted: Whether the multirun was interrupted.
+        is_interrupted: Whether the multirun was interrupted. Default: False.
 
     Returns:
         The exit code: 0 if every job succeeded, or if this was not a multirun; 1 otherwise.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import tempfile
 from collections.abc import Sequence
@@ -35,7 +34,6 @@ def compare_runs(text: str, uri: str, out: str | None) -> Path:
         TrackingError: If one of them is not found, cannot be compared, or has a damaged file.
     """
     named = read_runs(text)
-    os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
     store = open_existing_store(uri)
     found = find_trainings(store, named)
     # Deferred: missing runs are reported before these are loaded.

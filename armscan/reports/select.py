@@ -26,7 +26,7 @@ def read_runs(text: str) -> list[str]:
     named = [name.strip() for name in text.split(",")]
     if not all(name.removeprefix(EXPERIMENT) for name in named):
         raise InvalidValueError(
-            f"--runs is {text!r}, but it must be ids of runs, or {EXPERIMENT}NAME, with commas between"
+            f"--runs is {text!r}, but it must be IDs of runs, or {EXPERIMENT}NAME, with commas between"
         )
     return list(dict.fromkeys(named))
 

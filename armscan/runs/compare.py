@@ -43,7 +43,7 @@ class Difference:
 
     @property
     def is_same(self) -> bool:
-        """Return whether the second run has all points of the first, equal to the last bit."""
+        """Whether the second run has all points of the first, equal to the last bit."""
         return self.n_missing == 0 and self.largest == 0.0
 
     @property
@@ -72,7 +72,7 @@ class Comparison:
 
     @property
     def is_same(self) -> bool:
-        """Return whether the second run has all metrics of the first, equal to the last bit."""
+        """Whether the second run has all metrics of the first, equal to the last bit."""
         return bool(self.differences) and all(each.is_same for each in self.differences)
 
     def lines(self) -> list[str]:

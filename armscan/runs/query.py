@@ -89,6 +89,6 @@ def experiment_ids(client: TrackingStore, name: str | None = None) -> list[str]:
     experiments = all_pages(client.search_experiments)
     found = [each.experiment_id for each in experiments if name in (None, each.name)]
     if not found and name is not None:
-        there = listed(each.name for each in experiments) if experiments else "none"
-        raise InvalidValueError(f"--experiment is {name!r}, but {client.uri} has only {there}")
+        there = f"only {listed(each.name for each in experiments)}" if experiments else "none"
+        raise InvalidValueError(f"--experiment is {name!r}, but {client.uri} has {there}")
     return found

@@ -86,7 +86,7 @@ def differences(original: Original) -> list[str]:
     tags, now = original.run.tags, {**code_state().tags, **environment_tags()}
     lines = [
         f"{what} was {tags.get(tag, 'not kept')}, and is {now.get(tag, 'not kept')}"
-        for tag, what in ((COMMIT, "the git commit"), (CONSTRAINTS_SUM, "the sum of constraints.txt"))
+        for tag, what in ((COMMIT, "the git commit"), (CONSTRAINTS_SUM, "the SHA-256 of constraints.txt"))
         if tags.get(tag) != now.get(tag)
     ]
     if any(tags.get(tag) != now.get(tag) for tag in (DIFF_SUM, DIRTY)):
@@ -112,7 +112,7 @@ def differences(original: Original) -> list[str]:
 
 def _changes(tags: Mapping[str, str]) -> str:
     if DIFF_SUM in tags:
-        return f"had the sum {tags[DIFF_SUM][:8]}"
+        return f"had the SHA-256 {tags[DIFF_SUM][:8]}"
     return {"false": "were none", "true": "were some"}.get(tags.get(DIRTY, ""), "were not kept")
 
 

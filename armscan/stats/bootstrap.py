@@ -105,7 +105,7 @@ def estimates(
     Args:
         columns: Statistic and values of each figure, by its name; one value for each episode, NaN to leave it out.
         subjects: Subject of each episode's volume.
-        trainings: Training of each episode; None if all are from one.
+        trainings: Training of each episode. Default: None, all are from one.
 
     Raises:
         InvalidValueError: If a column has another length than `subjects`, or there is no episode.

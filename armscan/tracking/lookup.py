@@ -13,7 +13,7 @@ from packaging.version import InvalidVersion, Version
 
 import armscan
 from armscan.config.trust import needs_trust, stored_config
-from armscan.errors import InvalidValueError, TrackingError, TrackingUnavailableError, listed
+from armscan.errors import InvalidValueError, TrackingError, TrackingUnavailableError, few, listed
 from armscan.tracking.client import TrackingStore, all_pages
 from armscan.tracking.store import open_existing_store, store_errors
 from armscan.tracking.tags import EVALUATED_TAG, VERSION_TAG
@@ -112,7 +112,7 @@ def load_run(uri: str, run_id: str) -> FoundRun:
     """Return the run with an MLflow run ID, or with these first characters of it, and its files.
 
     Raises:
-        TrackingError: If no run or several runs match, the run is a multirun's parent or a newer version's, or the
+        TrackingError: If no run or several runs match, the run has runs below it or is a newer version's, or the
             store does not exist or cannot be used.
     """
     check_run_id(run_id)
@@ -122,9 +122,7 @@ def load_run(uri: str, run_id: str) -> FoundRun:
         check_version(run)
         children = client.children(run.info.experiment_id, run.info.run_id)
         if jobs := [child.info.run_id for child in children if EVALUATED_TAG not in child.data.tags]:
-            raise TrackingError(
-                f"run {run.info.run_id} is the parent of a multirun: give one of its jobs, {listed(jobs)}"
-            )
+            raise TrackingError(f"run {run.info.run_id} has runs below it: give one of them, {few(jobs)}")
         return FoundRun(
             client=client,
             uri=uri,
@@ -155,7 +153,7 @@ def find_run(client: TrackingStore, run_id: str) -> Run:
         raise TrackingError(f"the run is {run_id!r}, but no run of {client.uri} has an ID that begins so")
     if len(found) > 1:
         ids = [run.info.run_id for run in found[:N_SHOWN]] + (["others"] if len(found) > N_SHOWN else [])
-        raise TrackingError(f"the run is {run_id!r}, but that may be {listed(ids)}: give more of the id")
+        raise TrackingError(f"the run is {run_id!r}, but that may be {listed(ids)}: give more of the ID")
     run: Run = found[0]
     return run
 
@@ -209,7 +207,7 @@ def check_run_id(run_id: str) -> None:
     """Raise `TrackingError` if a string cannot be an MLflow run ID or its beginning."""
     if not ID.fullmatch(run_id):
         raise TrackingError(
-            f"the run is {run_id!r}, but it must be an id as MLflow shows it, or its beginning: up to 32 of 0-9 and a-f"
+            f"the run is {run_id!r}, but it must be an ID as MLflow shows it, or its beginning: up to 32 of 0-9 and a-f"
         )
 
 

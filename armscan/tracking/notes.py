@@ -57,7 +57,7 @@ class Note:
 
     @property
     def is_abandoned(self) -> bool:
-        """Return whether the process that tracked the run is known to have died."""
+        """Whether the process that tracked the run is known to have died."""
         return self.process.is_here and not self.process.is_alive
 
 

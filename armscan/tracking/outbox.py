@@ -108,7 +108,7 @@ class OutboxFile:
 
     @property
     def is_uploaded(self) -> bool:
-        """Return whether everything is uploaded."""
+        """Whether everything is uploaded."""
         return all(not self.next_entries(channel, 1)[0] for channel in CHANNELS)
 
     @property

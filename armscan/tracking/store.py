@@ -28,7 +28,7 @@ LOCK_TIMEOUT_S = 120
 # MLflow's length limit for an experiment's name and artifact location, and how much of a longer one an error shows.
 MAX_TEXT_CHARS, N_SHOWN_CHARS = 500, 40
 # `wait_s` of a store that is opened without a configuration.
-USUAL_WAIT_S = 120.0
+DEFAULT_WAIT_S = 120.0
 # Report an unavailable server within seconds, not after minutes of retries.
 DEFAULTS = {
     "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "2",
@@ -117,7 +117,7 @@ def open_existing_store(uri: str) -> TrackingStore:
         _check_is_store(uri, database)
         uri = f"{SQLITE_PREFIX}{database}"
     with store_errors(uri):
-        store = _store(uri, wait_s=USUAL_WAIT_S)
+        store = _store(uri, wait_s=DEFAULT_WAIT_S)
         store.search_experiments(max_results=1)
         return store
 
@@ -172,7 +172,9 @@ def _check_address(uri: str) -> None:
     except ValueError:
         is_server = False
     if not is_server:
-        raise TrackingError(f"tracking.uri is {uri!r}, but that is not the address of a server")
+        raise TrackingError(
+            f"tracking.uri is {uri!r}, but a server's address must have a host, such as http://127.0.0.1:5000"
+        )
 
 
 @contextlib.contextmanager

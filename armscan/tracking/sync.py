@@ -51,7 +51,7 @@ def sync(folder: Path, opened: Callable[[str], TrackingStore], *, trust: bool = 
 
     Args:
         folder: Folder of a run, of a study, or above them.
-        opened: Function that opens a store by its address; called once for each address.
+        opened: Function that opens a store by its address.
         trust: Whether to write to runs tracked from other machines, and to upload files outside of a run's folder.
             Default: False.
 

@@ -49,7 +49,7 @@ class Uploader:
 
     @property
     def is_unavailable(self) -> bool:
-        """Return whether the store is unavailable, as far as known, rather than refusing entries."""
+        """Whether the store is unavailable, as far as known, rather than refusing entries."""
         return self._failure is None or unavailable_reason(self._failure) is not None
 
     def wake(self) -> None:

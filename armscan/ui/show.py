@@ -86,10 +86,16 @@ def show(
 def last_judged(storage: Storage) -> tuple[str, int] | None:
     """Return the name and the number of the last study with a result; None if there is none."""
     # Deferred, as above.
+    from optuna.trial import TrialState
+
     from armscan.sweeps.storage.attributes import JUDGEMENT_SUFFIX
 
+    def is_judged(name: str) -> bool:
+        judgement = storage.study(f"{name}{JUDGEMENT_SUFFIX}")
+        return judgement is not None and bool(judgement.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)))
+
     numbers = {study.study_name: study._study_id for study in storage.optuna.get_all_studies()}
-    judged = [name for name in numbers if f"{name}{JUDGEMENT_SUFFIX}" in numbers]
+    judged = filter(is_judged, numbers)
     return max(((name, numbers[name]) for name in judged), key=itemgetter(1), default=None)
 
 

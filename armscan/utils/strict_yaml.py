@@ -49,7 +49,9 @@ def load_yaml(text: str | bytes) -> Any:
                 sizes.append(0)
         # The first of them is no collection, but the stream.
         if len(open_nodes) > DEEPEST + 1 or sizes[-1] > MAX_NODES:
-            raise ValueError(f"it is nested more than {DEEPEST} deep, or repeats more than {MAX_NODES} nodes")
+            raise ValueError(
+                f"it is nested more than {DEEPEST} deep, or has more than {MAX_NODES} nodes with its aliases expanded"
+            )
     return yaml.load(text, yaml.CSafeLoader)
 
 

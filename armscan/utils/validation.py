@@ -91,7 +91,7 @@ def check_ints(
     """
     is_sequence = isinstance(value, Sequence) and not isinstance(value, str | bytes | bytearray | memoryview)
     if not is_sequence or len(value) < min_length or (length is not None and len(value) != length):
-        wanted = f"a list of{' 1 or more' if min_length else ''}" if length is None else str(length)
+        wanted = f"a list of{f' {min_length} or more' if min_length else ''}" if length is None else str(length)
         raise InvalidValueError(f"{name} is {value!r}, but it must be {wanted} whole numbers{meaning and ' '}{meaning}")
     return tuple(check_int(f"each of {name}", number, **bounds) for number in value)
 

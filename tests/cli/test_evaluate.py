@@ -16,7 +16,7 @@ def test_evaluate_answers_mistakes_in_one_line(evaluate, tmp_path, data_folder):
         ([run_id, "--projection=zy"], "No such option '--projection'."),
         (["--agent=random", "seed=5"], "seed cannot be set here: give --seed NUMBER"),
         (["--agent=random", "agent=sac"], "agent cannot be set here: give --agent NAME"),
-        (["xyz"], "the run is 'xyz', but it must be an id as MLflow shows it"),
+        (["xyz"], "the run is 'xyz', but it must be an ID as MLflow shows it"),
         (["ffffffff"], "the run is 'ffffffff', but no run of sqlite:///"),
         ([run_id, "--tracking=sqlite:///no.db"], "tracking.uri is 'sqlite:///no.db', but there is no "),
         ([run_id, "--data=/nowhere"], "--data is '/nowhere', but there is no such folder: it must be "),

@@ -125,7 +125,7 @@ def test_bad_words_are_answered_in_one_line_and_change_nothing(answer, tmp_path)
         (["export", run, out, name], "No such option '--name'."),
         (["export", run, "--out="], "Invalid value for '--out': a path is required."),
         (["export", run, out, "--tracking="], "Invalid value for '--tracking': an address is required."),
-        (["export", "nobody", out], "the run is 'nobody', but it must be an id"),
+        (["export", "nobody", out], "the run is 'nobody', but it must be an ID"),
         (["export", "0" * 32, out], f"the run is '{'0' * 32}', but no run of"),
         (["export", run, out, "--tracking=sqlite:///none.db"], "tracking.uri is 'sqlite:///none.db', but there is no"),
         (["export", run, "--out=other"], "--out is 'other', but something else is there, and would be lost"),

@@ -54,7 +54,7 @@ def test_evaluate_of_a_multirun_asks_for_one_of_its_jobs(evaluate, tmp_path):
     parent = client.create_run(client.get_run(job_id).info.experiment_id, run_name="multirun")
     client.set_tag(job_id, "mlflow.parentRunId", parent.info.run_id)
     _, _, errors = evaluate(parent.info.run_id)
-    assert errors == f"error: run {parent.info.run_id} is the parent of a multirun: give one of its jobs, {job_id}"
+    assert errors == f"error: run {parent.info.run_id} has runs below it: give one of them, {job_id}"
 
 
 def test_runs_that_have_kept_too_little_are_refused_with_what_to_do(evaluate, tmp_path):

@@ -271,8 +271,8 @@ def test_resume_names_a_store_that_is_not_there_and_makes_none(answer, tmp_path,
 
 def test_resume_names_a_run_that_is_not_there(answer, cut_off):
     assert "but no run of " in refused(answer, f"resume={'0' * 31}")
-    assert "must be an id as MLflow shows it" in refused(answer, "resume=")
-    assert "must be an id as MLflow shows it" in refused(answer, "resume='; DROP TABLE runs")
+    assert "must be an ID as MLflow shows it" in refused(answer, "resume=")
+    assert "must be an ID as MLflow shows it" in refused(answer, "resume='; DROP TABLE runs")
 
 
 def test_resume_refuses_a_configuration_that_was_changed(answer, cut_off):

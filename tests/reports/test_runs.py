@@ -177,12 +177,12 @@ def test_report_of_runs_answers_mistakes_in_one_line(answer, runs, tmp_path):
     other = runs.made("other")
     beginning = next(each for each in "0123456789abcdef" if sum(run.info.run_id[0] == each for run in runs.all) == 0)
     words_and_lines = [
-        (["--runs="], "--runs is '', but it must be ids of runs"),
-        (["--runs=,"], "--runs is ',', but it must be ids of runs, or experiment:NAME, with commas between"),
-        (["--runs=experiment:"], "--runs is 'experiment:', but it must be ids of runs"),
+        (["--runs="], "--runs is '', but it must be IDs of runs"),
+        (["--runs=,"], "--runs is ',', but it must be IDs of runs, or experiment:NAME, with commas between"),
+        (["--runs=experiment:"], "--runs is 'experiment:', but it must be IDs of runs"),
         (["--runs=a", "--study=b"], "--study and --runs are both given, but a report is of one of them"),
         (["--runs=a", "--storage=b"], "--storage is given, but it is for --study, and this report is of --runs"),
-        (["--runs=xyz"], "the run is 'xyz', but it must be an id as MLflow shows it"),
+        (["--runs=xyz"], "the run is 'xyz', but it must be an ID as MLflow shows it"),
         (["--runs=" + beginning * 30], f"the run is '{beginning * 30}', but no run of sqlite:///"),
         (["--runs=experiment:nobody"], "the experiment is 'nobody', but in 'sqlite:///"),
         (["--runs=experiment:Default"], "the experiment is 'Default', but in 'sqlite:///"),

@@ -47,7 +47,7 @@ def test_runs_answers_mistakes_in_one_line(answer, make_run, tmp_path):
         ),
         (["show"], "Missing argument 'RUN'."),
         (["show", "--run=3"], "No such option '--run'."),
-        (["show", "xyz"], "the run is 'xyz', but it must be an id as MLflow shows it"),
+        (["show", "xyz"], "the run is 'xyz', but it must be an ID as MLflow shows it"),
         (["show", run_id, "--agent=sac"], "No such option '--agent'."),
         (["prune"], "Missing argument '{checkpoints|folders}'. Choose from: checkpoints, folders"),
         (["prune", "all"], "Invalid value for '{checkpoints|folders}': 'all' is not one of 'checkpoints', "),

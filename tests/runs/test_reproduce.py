@@ -137,8 +137,8 @@ def test_reproduce_lists_what_differs_and_runs_nothing_where_it_is_not_to(made, 
         code, printed, errors = answer(run.info.run_id, "--dry-run")
     assert (code, errors) == (1, "")
     assert f"differs: the git commit was {'0' * 40}, and is {code_state().commit}" in printed
-    assert f"differs: the sum of constraints.txt was {'1' * 64}, and is" in printed
-    assert "differs: changes since the commit had the sum 22222222, and" in printed
+    assert f"differs: the SHA-256 of constraints.txt was {'1' * 64}, and is" in printed
+    assert "differs: changes since the commit had the SHA-256 22222222, and" in printed
     assert f"differs: python was 2.7, and is {environment()['python']}" in printed
     assert f"differs: torch was 1.0, and is {environment()['packages']['torch']}" in printed
     assert "differs: 1 other packages have other versions, or are there in one case only: pytest" in printed

@@ -326,7 +326,7 @@ def test_run_that_cannot_be_made_is_answered_in_one_line(server, opened, tmp_pat
 
 @pytest.mark.parametrize("uri", ["http://[bad", "http://host:port", "http://"])
 def test_address_that_is_none_is_answered_at_once(uri):
-    with pytest.raises(TrackingError, match="but that is not the address of a server"):
+    with pytest.raises(TrackingError, match="but a server's address must have a host"):
         open_store(uri, experiment="test", artifacts="-", wait_s=1.0)
 
 

@@ -371,12 +371,12 @@ def test_find_run_takes_the_beginning_of_an_id_and_names_what_is_wrong(store):
     assert {find_run(client, run_id).info.run_id for run_id in ids} == set(ids)
     firsts = [run_id[0] for run_id in ids]
     twice = next(first for first in firsts if firsts.count(first) > 1)
-    with pytest.raises(TrackingError, match=f"the run is '{twice}', but that may be {twice}.*: give more of the id"):
+    with pytest.raises(TrackingError, match=f"the run is '{twice}', but that may be {twice}.*: give more of the ID"):
         find_run(client, twice)
     shortest = next(ids[0][:n] for n in range(1, 33) if sum(other.startswith(ids[0][:n]) for other in ids) == 1)
     assert find_run(client, shortest).info.run_id == ids[0]
     for nonsense in ("", "%", "' OR 1=1", "XYZ", 33 * "a"):
-        with pytest.raises(TrackingError, match="but it must be an id as MLflow shows it"):
+        with pytest.raises(TrackingError, match="but it must be an ID as MLflow shows it"):
             find_run(client, nonsense)
     with pytest.raises(TrackingError, match=r"no run of sqlite:.* has an ID that begins so"):
         find_run(client, 32 * "a")

@@ -173,10 +173,14 @@ def test_ui_names_a_port_that_is_taken_and_starts_nothing(both, monkeypatch, cap
 
 def test_page_of_the_last_study_with_a_result_is_found(tmp_path):
     storage = open_storage(str(tmp_path / "optuna.journal"))
-    for name in ("a", "a-selection", "a-judged", "b", "b-selection", "b-judged", "c", "c-selection"):
-        optuna.create_study(study_name=name, storage=storage.optuna)
+    for name in ("a", "a-selection", "a-judged", "b", "b-selection", "b-judged", "c", "c-selection", "c-judged"):
+        study = optuna.create_study(study_name=name, storage=storage.optuna)
         if name == "a":
             assert last_judged(storage) is None
+        # A study that has begun has an empty judgement.
+        if name in ("a-judged", "b-judged"):
+            attributes = {"judged": -1, "judged_seed": 2000, "figures": {}}
+            study.add_trial(optuna.trial.create_trial(value=1.0, user_attrs=attributes))
     assert last_judged(storage) == ("b", 3)
 
 

@@ -32,7 +32,7 @@ from armscan.utils.text import counted
 
 
 def print_result(opened: OpenedStudy) -> int:
-    """Print the result of a study; return the exit code, `os.EX_TEMPFAIL` if only the same command is missing."""
+    """Print the result of a study; return the exit code, `os.EX_TEMPFAIL` if the same command continues the study."""
     scheduler, settings = opened.search.scheduler, opened.settings
     state = scheduler.state()
     print_sentence(status_line(opened, state))

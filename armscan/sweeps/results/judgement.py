@@ -180,7 +180,10 @@ class Judgement:
             return f"{name} was chosen; one seed does not show whether it is better than the control."
         if first.is_alike:
             value = value_text(first.metric, first.paired.value)
-            return f"{name} was chosen; its difference to the control is {value} in all ({title_of(first.metric)})."
+            return (
+                f"{name} was chosen; its difference from the control is {value} for every seed and "
+                f"volume ({title_of(first.metric)})."
+            )
         if first.verdict:
             return f"{name} is {first.verdict} than the control ({title_of(first.metric)})."
         return (

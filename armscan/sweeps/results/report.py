@@ -25,6 +25,7 @@ from armscan.sweeps.study.final_eval import FinalEvaluation, name_of, settings_o
 from armscan.sweeps.study.study import best_trials
 from armscan.training.metric_display import title_of, value_text
 from armscan.utils.run_files import ID_CHARS
+from armscan.utils.text import counted
 
 # Names of trial states for users.
 STATES = {"complete": "finished", "fail": "failed"}
@@ -87,7 +88,7 @@ def _summary(study: optuna.Study, state: StudyState, best: Sequence[FrozenTrial]
     ended = study.user_attrs.get(TERMINATED, {}).get(REASON)
     hours = state.busy_hours
     text = (
-        f"{len(state.finished)} trials finished, {state.n_pruned} of them pruned{violating}; "
+        f"{counted(len(state.finished), 'trial')} finished, {state.n_pruned} of them pruned{violating}; "
         f"{len(state.running)} running, {len(state.failed)} failed, "
         f"{len(state.retried)} retried after their worker died{taken}. {state.env_steps:,} environment steps in "
         f"{f'{hours:.1f} hours' if hours >= 1 else f'{60 * hours:.1f} minutes'}."
@@ -182,7 +183,7 @@ def _judgement(judgement: Judgement) -> str:
     said = f"<p><strong>{html.escape(judgement.result)}</strong></p>{notes}"
     if not judgement.differences:
         return said
-    seeds = f"Both were trained with the same {judgement.n_seeds} seeds, which nothing before has used."
+    seeds = f"Both were trained with the same {counted(judgement.n_seeds, 'seed')}, which nothing before has used."
     return f"{said}{table([each.row() for each in judgement.differences])}<p>{HOW} {seeds}</p>"
 
 

@@ -35,7 +35,7 @@ class Candidate(NamedTuple):
         scores: The objective on the validation volumes by seed, NaN for a training that failed.
         estimate: Its mean with the 95 % interval by which candidates are compared.
         n_seeds: Number of seeds that the estimate is over.
-        outcome: Outcome of the race: `chosen`, `failed`, `not chosen`, or `in the race`.
+        outcome: Outcome of the race: `chosen`, `failed`, `violates a constraint`, `not chosen`, or `in the race`.
         settings: Its values as overrides.
     """
 
@@ -105,6 +105,8 @@ def _outcome(race: Race, number: int) -> str:
         return "chosen"
     if race.standings[number].has_failed:
         return "failed"
+    if race.standings[number].has_left:
+        return "violates a constraint"
     return "not chosen" if race.is_over else "in the race"
 
 
@@ -147,17 +149,19 @@ def decision_section(
         f"ahead of all others (one-sided t tests at {100 * END_LEVEL:.0f} %). "
     )
     steps = [
-        f"<b>Search</b>: {len(searched.finished)} trials, {searched.n_pruned} of them pruned. Candidates are its best "
-        f"different configurations ({n_candidates}), and the control: {NOTHING_SEARCHED}.",
-        f"<b>Selection</b>, on the validation volumes: {n_selected} trainings with seeds that the search has not used, "
-        f"compared by {html.escape(title_of(objective))} ({better} is better). Each candidate got {n_seeds}. "
+        f"<b>Search</b>: {counted(len(searched.finished), 'trial')}, {searched.n_pruned} of them pruned. Candidates "
+        f"are its best different configurations ({n_candidates}), and the control: {NOTHING_SEARCHED}.",
+        f"<b>Selection</b>, on the validation volumes: {counted(n_selected, 'training')} with seeds that the search "
+        f"has not used, compared by {html.escape(title_of(objective))} ({better} is better). Each "
+        f"candidate got {n_seeds}. "
         f"{further if settings.min_seeds < settings.mean_seeds else ''}"
-        "The candidate whose interval has the best worst-case end is chosen.",
+        "The candidate whose interval has the best pessimistic end is chosen.",
     ]
     if judgement is not None:
         judged = "the control alone" if judgement.chosen == CONTROL else f"{name_of(judgement.chosen)} and the control"
         steps.append(
-            f"<b>Judgement</b>, on the test volumes: {judged}, with {settings.judge_seeds} seeds of their own."
+            f"<b>Judgement</b>, on the test volumes: {judged}, with {counted(settings.judge_seeds, 'seed')} of their "
+            "own."
         )
     listed = "".join(f"<li>{step}</li>" for step in steps)
     if not candidates:

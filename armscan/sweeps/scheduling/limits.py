@@ -12,8 +12,8 @@ from armscan.sweeps.storage.attribute_names import FAILURE
 from armscan.sweeps.storage.reports import reports_of
 from armscan.utils.section import Section
 
-# If this many trials fail before any reports, the configuration is at fault.
-FAILURES_AT_ONCE = 3
+# If this many trials fail before any of them reports anything, the configuration is at fault.
+FAILURES_BEFORE_REPORTS = 3
 
 
 class LimitReachedError(Exception):
@@ -55,7 +55,7 @@ class Limits(Section):
             return f"{len(failed)} trials have failed, and at most {self.max_failures} may: {_reason(failed[-1])}"
         # Final trainings never report, so their environment steps count, too.
         got_nowhere = not state.finished and not any(reports_of(each) or env_steps_of(each) for each in state.all)
-        if len(failed) >= FAILURES_AT_ONCE and got_nowhere:
+        if len(failed) >= FAILURES_BEFORE_REPORTS and got_nowhere:
             return f"the first {len(failed)} trials failed before they reported anything: {_reason(failed[0])}"
         return None
 

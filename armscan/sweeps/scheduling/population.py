@@ -38,8 +38,8 @@ class PopulationSampler(RandomSampler):
         population: Number of members, 2 or more.
         interval_env_steps: Environment steps of a generation; divides those of the whole training.
         quantile: Fraction of the members, above 0 and at most 0.5, that counts as worst; each of these continues from
-            one of equally many best members.
-        resample_probability: Probability of resampling a value instead of changing it by a fifth.
+            one of equally many best members. Default: 0.25.
+        resample_probability: Probability of resampling a value instead of changing it by a fifth. Default: 0.25.
         seed: Seed of the draws. Default: None, other draws each time.
     """
 

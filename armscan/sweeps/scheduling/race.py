@@ -44,12 +44,14 @@ class Standing:
     Args:
         estimate: Mean score with its 95 % interval; NaN before the first round is complete.
         n_seeds: Number of seeds that the estimate is over.
-        has_failed: Whether one of its trainings has failed.
+        has_failed: Whether one of its trainings has failed. Default: False.
+        has_left: Whether it has left the race without a failure. Default: False.
     """
 
     estimate: Estimate = UNKNOWN
     n_seeds: int = 0
     has_failed: bool = False
+    has_left: bool = False
 
     @property
     def lower_end(self) -> float:
@@ -62,7 +64,7 @@ class Race:
     """State of a race.
 
     Args:
-        n_trained: Number of trainings that have a score.
+        n_trained: Number of trainings that have a score, without those of configurations that have left.
         missing: Trainings of this round without a score, the running ones included, as pairs of a configuration and a
             seed. Empty if the race is over.
         chosen: Configuration that was chosen; None while the race continues, or if all configurations have failed in
@@ -77,14 +79,14 @@ class Race:
 
     @property
     def is_over(self) -> bool:
-        """Return whether no training is missing."""
+        """Whether no training is missing."""
         return not self.missing
 
     @property
     def leader(self) -> int | None:
         """Configuration with the best mean; None before the first round is complete, or if all have failed."""
         standings = self.standings
-        left = [each for each in standings if standings[each].n_seeds and not standings[each].has_failed]
+        left = [each for each, of_it in standings.items() if of_it.n_seeds and not (of_it.has_failed or of_it.has_left)]
         return max(left, key=lambda each: standings[each].estimate.value, default=None)
 
 

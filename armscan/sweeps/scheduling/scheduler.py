@@ -69,7 +69,7 @@ class TrialScheduler:
         self.limits, self._plan = limits, plan
         self._is_current = is_current
         self.termination = termination
-        # Who asked the study to stop, as far as this process knows; see `read_stop_request`.
+        # When and by whom the study was stopped, as far as this process knows; see `read_stop_request`.
         self.stopped = ""
 
     def state(self) -> StudyState:
@@ -115,6 +115,7 @@ class TrialScheduler:
         # A search reads its trials only once for a claim.
         for trial in filterfalse(self._is_current, self.state().waiting) if self._is_current else ():
             self.study._storage.set_trial_user_attr(trial._trial_id, RETRIED, True)
+            self.study._storage.set_trial_user_attr(trial._trial_id, FAILURE, "the study has another configuration")
             self.study._storage.set_trial_state_values(trial._trial_id, TrialState.FAIL)
 
     def _tell(self, outcome: TrialOutcome, *, is_repeated: bool) -> None:
@@ -158,7 +159,7 @@ class TrialScheduler:
         return f"the study was stopped {self.stopped}" if self.stopped else None
 
     def failure_reason(self, state: StudyState) -> str | None:
-        """See `Limits.failure_reason`; failures before the last restart are ignored."""
+        """See `Limits.failure_reason`; ignored failures do not count, see `reset_failures`."""
         return self.limits.failure_reason(state, self.failures(state))
 
     def check_termination(self, state: StudyState | None = None) -> None:
@@ -167,7 +168,7 @@ class TrialScheduler:
             self.termination.check(state or self.state())
 
     def read_stop_request(self) -> str:
-        """Return the user who stopped the study; an empty string if it was not stopped."""
+        """Return when and by whom the study was stopped; an empty string if it was not."""
         self.stopped = str(self.study.user_attrs.get(STOP, ""))
         return self.stopped
 

@@ -37,9 +37,9 @@ class StudyState:
     Args:
         finished: Trials that ran to their end or were pruned.
         running: Trials that workers run.
-        waiting: Requeued trials and enqueued retries.
+        waiting: Trials that no worker runs yet: requeued ones, retries, and enqueued settings.
         failed: Trials that raised, or whose workers died too often.
-        retried: Attempts whose worker died, and that were retried.
+        retried: Attempts that count nowhere: their worker died and they were retried, or they were dropped.
         taken: Finished trials taken from other studies, which count towards no limit.
     """
 

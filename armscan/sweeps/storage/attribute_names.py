@@ -6,8 +6,8 @@ SPACE, FIXED, OBJECTIVES = "space", "fixed_config", "objectives"
 OF_STUDY = {SPACE, FIXED, OBJECTIVES}
 # Its tracked run, the SHA-256 of armscan's own note in the dashboard, and the origins of its initial trials.
 STUDY_RUN, NOTE_SUM, BEGUN_WITH = "mlflow_run", "note_sha256", "begun_with"
-# Why it has ended, and the settings asked for at that time, or its finished trials when it was reopened since; trials
-# whose failures are ignored.
+# Why it has ended, and the settings asked for at that time, or, once it is reopened, the number of trials finished by
+# then; trials whose failures are ignored.
 TERMINATED, RESET_FAILURES = "terminated", "forgiven"
 # Of a trial or a study: when it was asked to stop, and by whom; empty once a study is resumed.
 STOP = "stop"

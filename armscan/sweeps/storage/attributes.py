@@ -191,9 +191,9 @@ def _check_final(trial: FrozenTrial, where: str, n_searched: int | None = None) 
     attributes = trial.user_attrs
     needed = [FINALIST, FINAL_SEED, *([METRICS] if trial.state == TrialState.COMPLETE else [])]
     if missing := [name for name in needed if name not in attributes]:
-        raise StudyError(f"{where}.user_attrs has no {missing[0]}, as each final training has")
+        raise StudyError(f"{where}.user_attrs lacks {missing[0]}, which each final training has")
     if n_searched is not None and attributes[FINALIST] >= n_searched:
         raise StudyError(
-            f"{where}.user_attrs.{FINALIST} is {attributes[FINALIST]}, but it must be the number of one of "
-            f"{n_searched} trials"
+            f"{where}.user_attrs.{FINALIST} is {attributes[FINALIST]}, but it must be -1 for the control, "
+            f"or the number of one of {n_searched} trials"
         )

@@ -126,7 +126,7 @@ def _is_there(file: Path) -> bool:
             return True
     except FileNotFoundError:
         return False
-    raise OSError(None, "what is there is no file")
+    raise OSError(None, "it is not a regular file")
 
 
 def _in_file(uri: str, file: Path, *, is_written: bool) -> Storage:

@@ -22,7 +22,7 @@ from armscan.launch.launchers import LAUNCHER
 
 STUDY = "study"
 TASK_TARGET, TRAINING_TASK = "study.task._target_", "armscan.sweeps.tasks.training.TrainingTask"
-USUAL_LAUNCHER = "submitit_local"
+DEFAULT_LAUNCHER = "submitit_local"
 WORKER_KEY, SPACE, STORAGE, SEARCH_PATH = "study.worker", "study.space", "study.storage", "hydra.searchpath"
 # An override of the space, of one of its keys, or of a part of a key, such as the lower end of its range.
 SPACE_OVERRIDE = re.compile(r"\+*study\.space(?:\.(.+?)(?:\.(low|high|log|step|choices|when))?)?=(.*)", re.DOTALL)
@@ -59,7 +59,7 @@ class StudyCommand:
     def launching(self) -> list[str]:
         """Overrides of the command line that launches the workers."""
         is_chosen = any(each.startswith(f"{LAUNCHER}=") for each in self.overrides)
-        return [*self.overrides, *([] if is_chosen else [f"{LAUNCHER}={USUAL_LAUNCHER}"])]
+        return [*self.overrides, *([] if is_chosen else [f"{LAUNCHER}={DEFAULT_LAUNCHER}"])]
 
 
 def trial_overrides(overrides: Sequence[str]) -> list[str]:

@@ -28,7 +28,7 @@ def note_run(
     experiment_id: str,
     run_id: str,
     folder: Path,
-    figures: str = "",
+    text: str = "",
 ) -> None:
     """Write the note of a study or a trial: a link to its tracked run, its folder, and its metrics.
 
@@ -40,7 +40,7 @@ def note_run(
         experiment_id: MLflow experiment ID of the run.
         run_id: MLflow run ID.
         folder: The folder of the study or the trial.
-        figures: Metrics in Markdown. Default: "", none.
+        text: Markdown below the link and the folder, such as the metrics. Default: "", none.
     """
     # Deferred: it takes a second, and only workers and launchers need it.
     from optuna_dashboard import get_note, save_note
@@ -48,7 +48,7 @@ def note_run(
     address = client.uri.rstrip("/") if client.uri.startswith("http") else LOCAL_UI
     link = f"[its run in MLflow]({address}/#/experiments/{experiment_id}/runs/{run_id})"
     begun = f"{link}, {run_id}\n\nits folder: `{folder.resolve()}`"
-    note = f"{begun}\n\n{figures}" if figures else begun
+    note = f"{begun}\n\n{text}" if text else begun
     if isinstance(target, optuna.Study):
         left = target.user_attrs.get(NOTE_SUM, sha256(begun.encode()))
         if (known := get_note(target)) and sha256(known.encode()) != left:

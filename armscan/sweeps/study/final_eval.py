@@ -182,7 +182,7 @@ class FinalEvaluation:
         return scores
 
     def race(self, scores: Scores | None = None) -> Race:
-        """Return the state of the selection's race, which a control that violates a constraint leaves after one round.
+        """Return the state of the selection's race; a control that violates a constraint leaves it early.
 
         Args:
             scores: Result of `scores`. Default: None, the current scores.
@@ -190,11 +190,12 @@ class FinalEvaluation:
         scores, settings = self.scores() if scores is None else scores, self.settings
         run = partial(race, seeds=self.selection_seeds, min_seeds=settings.min_seeds)
         others = {number: scores[number] for number in scores if number != CONTROL}
-        has_begun = scores.get(CONTROL, {}).keys() >= set(self.selection_seeds[: settings.min_seeds])
-        if others and has_begun and self.violated_by_control():
+        has_ended_round = scores.get(CONTROL, {}).keys() >= set(self.selection_seeds[: settings.min_seeds])
+        if others and has_ended_round and self.violated_by_control():
             found = run(others, mean_seeds=settings.mean_seeds)
             alone = run({CONTROL: scores[CONTROL]}, mean_seeds=settings.min_seeds)
-            return replace(found, standings={**alone.standings, **found.standings})
+            gone = {CONTROL: replace(alone.standings[CONTROL], has_left=True)}
+            return replace(found, standings={**gone, **found.standings})
         return run(scores, mean_seeds=settings.mean_seeds)
 
     def violated_by_control(self) -> list[str]:
@@ -204,10 +205,10 @@ class FinalEvaluation:
             for trial in self._counted_trials(self.selection)
             if trial.state == TrialState.COMPLETE and training_of(trial)[0] == CONTROL
         ]
-        constraints = map(Constraint.read, self.search.user_attrs.get(FIXED, {}).get(CONSTRAINTS, ()))
+        stored = self.search.user_attrs.get(FIXED, {}).get(CONSTRAINTS)
         return [
             str(each)
-            for each in constraints
+            for each in map(Constraint.read, stored if isinstance(stored, list) else ())
             if metrics and each.violation({each.metric: fmean(of.get(each.metric, math.nan) for of in metrics)}) > 0
         ]
 
@@ -225,8 +226,11 @@ class FinalEvaluation:
 
         The control is always judged, so idle workers train it before the race ends.
         """
-        judged = to_judge(self.race())
-        return self._planned([(number, seed) for seed in self.judge_seeds for number in judged], self.judgement)
+        return self._planned(self.trainings_of_judgement(self.race()), self.judgement)
+
+    def trainings_of_judgement(self, race: Race) -> list[tuple[int, int]]:
+        """Return the trainings of the judgement, as far as they are known: pairs of a configuration and a seed."""
+        return [(number, seed) for seed in self.judge_seeds for number in to_judge(race)]
 
     @property
     def n_unjudged(self) -> int:
@@ -236,7 +240,7 @@ class FinalEvaluation:
             for trial in self._counted_trials(self.judgement)
             if trial.state.is_finished() and RETRIED not in trial.user_attrs
         }
-        return len({(number, seed) for number in to_judge(self.race()) for seed in self.judge_seeds} - ended)
+        return len(set(self.trainings_of_judgement(self.race())) - ended)
 
     def judged(self) -> dict[tuple[int, int], FrozenTrial]:
         """Return the complete trainings of the judgement, by configuration and seed."""
@@ -244,11 +248,11 @@ class FinalEvaluation:
         return {training_of(trial): trial for trial in counted if trial.state == TrialState.COMPLETE}
 
     def blocked(self) -> list[optuna.Study]:
-        """Return its studies that failed trainings, if any, leave without a choice or a seed of the judgement."""
+        """Return the studies that failed trainings block: without a choice, or without a seed of the judgement."""
         race, found = self.race(), []
         if race.is_over and race.chosen is None:
             found.append(self.selection)
-        wanted = {(number, seed) for number in to_judge(race) for seed in self.judge_seeds}
+        wanted = self.trainings_of_judgement(race)
         trials = [trial for trial in self._counted_trials(self.judgement) if training_of(trial) in wanted]
         if any(trial.state in ENDED_WITHOUT_SCORE and RETRIED not in trial.user_attrs for trial in trials):
             found.append(self.judgement)
@@ -268,14 +272,14 @@ class FinalEvaluation:
         ]
 
     def is_current(self, trial: FrozenTrial) -> bool:
-        """Return whether a final training has the study's configuration, as those of earlier versions always do."""
+        """Return whether a final training has the study's configuration; without a checksum, it counts as if it had."""
         return bool(trial.user_attrs.get(OF_CONFIG, self.config_sha256) == self.config_sha256)
 
     def _counted_trials(self, study: optuna.Study) -> list[FrozenTrial]:
         """Return the trials of a study that count.
 
-        Not those of an earlier configuration of the study, nor failed ones that are ignored since its last start: both
-        are run again.
+        Not those of an earlier configuration of the study, nor failed ones that a later start ignores: both are
+        run again.
         """
         ignored = study.user_attrs.get(RESET_FAILURES, ())
         trials = study.get_trials(deepcopy=False)

@@ -67,7 +67,7 @@ def open_for_work(
         Path(folder).mkdir(parents=True, exist_ok=True)
     storage = open_storage(settings.storage, retry=retry)
     study = make_study(storage, settings, fixed_config(config, overrides, volumes))
-    _own(Path(settings.folder), study)
+    _claim_folder(Path(settings.folder), study)
     objectives = tuple(settings.objectives)
     population = population_of(settings, config)
     plan = None if population is None else lambda: population.plan(study.get_trials(deepcopy=False))
@@ -96,7 +96,7 @@ def open_for_work(
     return OpenedStudy(settings=settings, config=config, search=search, final_eval=final_eval, finals=finals)
 
 
-def _own(folder: Path, study: optuna.Study) -> None:
+def _claim_folder(folder: Path, study: optuna.Study) -> None:
     """Write the name of a study into its folder; raise `StudyError` if another study's files are there."""
     file, name = folder / OWNER_FILE, study.study_name
     if not file.exists():

@@ -40,7 +40,7 @@ class Phase:
         seeds_of: Function that returns the training seeds of a trial.
         sampler: Sampler; see `StudySettings`.
         seed: Seed of the samplers, combined with a trial's number.
-        folder: Folder of its study.
+        folder: Folder of the phase.
         artifacts: Folder of the plots; see `StudySettings`.
         client: Client of the tracking store.
         experiment_id: MLflow experiment ID of the tracked runs.

@@ -21,7 +21,7 @@ from armscan.sweeps.scheduling.race import budget, round_size
 from armscan.sweeps.scheduling.state import StudyState, seconds_of
 from armscan.sweeps.scheduling.termination import ended_because
 from armscan.sweeps.space.parameter import Parameter
-from armscan.sweeps.study.final_eval import FinalEvaluation, n_trainings, to_judge
+from armscan.sweeps.study.final_eval import FinalEvaluation, n_trainings
 from armscan.sweeps.study.settings import FinalEvalSettings, StudySettings
 from armscan.sweeps.study.warm_start import InitialTrials
 from armscan.utils.console import WHOLE_CHARS, wide_console
@@ -55,7 +55,7 @@ def print_plan(
         table.add_row(*map(Text, (parameter.name, _values(parameter), needs)))
     console.print(table)
     objectives = ", ".join(f"{direction} {name}" for name, direction in settings.objectives.items())
-    limits = [f"{settings.n_trials} trials"]
+    limits = [counted(settings.n_trials, "trial")]
     limits += [f"{settings.timeout_hours:g} hours"] if settings.timeout_hours is not None else []
     limits += [f"{settings.max_env_steps:,} environment steps"] if settings.max_env_steps is not None else []
     console.print(f"objective  {objectives}, over {_seeds(settings.seeds)}")
@@ -65,7 +65,7 @@ def print_plan(
         console.print(printable(f"begins     {each.message}"), markup=False, highlight=False)
     others = (("failed", state.failed), ("waiting", state.waiting))
     also = "".join(f", {len(trials)} {what}" for what, trials in others if trials)
-    console.print(f"done       {(done := len(state.finished))} trials{also}")
+    console.print(f"done       {counted(done := len(state.finished), 'trial')}{also}")
     if done:
         ended = ended_because(study, settings.asked) if study is not None else None
         ended = ended or settings.limit_reason(state)
@@ -146,12 +146,13 @@ def final_trainings_left(settings: StudySettings, final: FinalEvaluation | None,
         return fewest, most
     final = replace(final, settings=settings.final_eval)
     race = final.race()
-    wanted = {(number, seed) for number in to_judge(race) for seed in final.judge_seeds}
+    wanted = set(final.trainings_of_judgement(race))
     n_judged = len(wanted & final.judged().keys())
     if race.is_over:
         return len(wanted) - n_judged, len(wanted) - n_judged
     asked = settings.final_eval
-    bounds = budget(len(race.standings), min_seeds=asked.min_seeds, mean_seeds=asked.mean_seeds)
+    n_racing = sum(not each.has_left for each in race.standings.values())
+    bounds = budget(n_racing, min_seeds=asked.min_seeds, mean_seeds=asked.mean_seeds)
     least, most = (max(bound - race.n_trained, len(race.missing)) - n_judged for bound in bounds)
     return least + asked.judge_seeds, most + 2 * asked.judge_seeds
 

@@ -33,8 +33,8 @@ class ParetoPruner(BasePruner):
     """
 
     def __init__(self, min_resource: int, reduction_factor: int = 3) -> None:
-        self._min_resource = check_int("min_resource", min_resource, at_least=1)
-        self._reduction_factor = check_int("reduction_factor", reduction_factor, at_least=2)
+        self._min_resource = check_int("study.pruner.min_resource", min_resource, at_least=1)
+        self._reduction_factor = check_int("study.pruner.reduction_factor", reduction_factor, at_least=2)
 
     def prune(self, study: optuna.Study, trial: FrozenTrial) -> bool:
         """Return whether to prune a trial, which is possible only at its first report on a rung."""

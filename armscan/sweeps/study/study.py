@@ -101,7 +101,7 @@ def existing_study(storage: Storage | None, settings: StudySettings, fixed: Mapp
 def fixed_config(
     config: DictConfig, overrides: Sequence[str], volumes: Mapping[str, str] | None = None
 ) -> dict[str, Any]:
-    """Return all of a study's configuration that is compared when it is started again.
+    """Return the configuration of a study's trials, their overrides and volumes; see `comparable_settings`.
 
     Args:
         config: Configuration of its trials without the searched values.

@@ -35,6 +35,7 @@ from armscan.sweeps.storage.reports import REPORT
 from armscan.sweeps.storage.storage import Storage, existing_storage
 from armscan.sweeps.study.settings import StudySettings
 from armscan.sweeps.study.study import best_trials, comparable_settings, fixed_of, is_ours
+from armscan.utils.text import counted
 
 PRESET, SOURCE = "preset {}", "study {}"
 # Number of best settings that are tried first, of a study with another configuration.
@@ -151,7 +152,7 @@ def _of_study(settings: StudySettings, name: str, fixed: Mapping[str, Any], stor
             misfits[misfit] += 1
         else:
             fitting.append((trial, chosen))
-    message = f"warm start from {name}, which has {len(trials)} finished trials: "
+    message = f"warm start from {name}, which has {counted(len(trials), 'finished trial')}: "
     left = f"; {sum(misfits.values())} do not fit, such as: {misfits.most_common(1)[0][0]}" if misfits else ""
     if difference is None:
         taken = tuple(_taken(name, trial, chosen, settings.space) for trial, chosen in fitting)

@@ -36,8 +36,8 @@ class Attempt:
     Args:
         trial: Trial as it is in the storage.
         overrides: Overrides that distinguish its configuration from that of other trials.
-        composed: Configuration without the seed, and the choice of each group.
-        command: Command that started the worker.
+        composed: Configuration, whose seed `config` replaces, and the choice of each group.
+        command: Command that resumes the study.
         seeds: Training seeds, used one after another.
         study_folder: Folder of the study.
         run_id: MLflow run ID of the trial.

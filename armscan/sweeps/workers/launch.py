@@ -21,7 +21,7 @@ from armscan.launch.launchers import LAUNCHER, ON_THIS_MACHINE, silence_launcher
 from armscan.sweeps.results.judgement import best_metrics, judge, result_note
 from armscan.sweeps.results.progress import progress_display
 from armscan.sweeps.space.parameter import hydra_literal
-from armscan.sweeps.study.arguments import STORAGE, USUAL_LAUNCHER, WORKER_KEY, StudyCommand, fixed_by
+from armscan.sweeps.study.arguments import DEFAULT_LAUNCHER, STORAGE, WORKER_KEY, StudyCommand, fixed_by
 from armscan.sweeps.study.dashboard import note_run
 from armscan.sweeps.study.phase import OpenedStudy
 from armscan.sweeps.workers.heartbeat import LivenessCheck
@@ -73,7 +73,7 @@ def run_workers(opened: OpenedStudy, given: StudyCommand, launcher: str, launch:
         with progress_display(opened, folder):
             if launcher not in ON_THIS_MACHINE:
                 _launch_elsewhere(monitor, folder, launcher, lambda: launch(arguments))
-            elif launcher == USUAL_LAUNCHER:
+            elif launcher == DEFAULT_LAUNCHER:
                 keep_gpus()
                 with _block_sigint():
                     launch(arguments)
@@ -92,7 +92,7 @@ def _arguments(opened: OpenedStudy, given: StudyCommand, launcher: str, folder: 
         f"{WORKER_KEY}={','.join(map(str, range(n_workers)))}",
         f"hydra.sweep.dir={hydra_literal(str(folder))}",
     ]
-    if launcher == USUAL_LAUNCHER:
+    if launcher == DEFAULT_LAUNCHER:
         # First, so that the user's overrides take precedence.
         arguments.insert(1, f"hydra.launcher.timeout_min={MINUTES_WITHOUT_END}")
     if launcher == "joblib":

@@ -6,7 +6,7 @@ import pytest
 from optuna.trial import TrialState
 
 from armscan.sweeps.results.console import print_result
-from armscan.sweeps.scheduling.limits import FAILURES_AT_ONCE
+from armscan.sweeps.scheduling.limits import FAILURES_BEFORE_REPORTS
 from armscan.sweeps.scheduling.state import CONTROL
 from armscan.sweeps.storage.attribute_names import ENV_STEPS, FINAL_SEED, FINALIST, METRICS
 from armscan.sweeps.study.settings import FinalEvalSettings
@@ -65,7 +65,7 @@ def test_study_whose_judgement_is_incomplete_can_be_resumed(searched, capsys):
 
 def test_failed_study_is_not_worth_the_same_command(study):
     search = study.search.scheduler.study
-    for _ in range(FAILURES_AT_ONCE):
+    for _ in range(FAILURES_BEFORE_REPORTS):
         search.tell(search.ask(), state=TrialState.FAIL)
     assert print_result(study) == 1
 

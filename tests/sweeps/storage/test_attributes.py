@@ -122,14 +122,17 @@ def test_attribute_of_a_study_of_any_type_is_refused_in_one_line_or_harmless(tmp
 @pytest.mark.parametrize(
     ("attributes", "line"),
     [
-        ({FINAL_SEED: 3}, r"a.trials\[0\].user_attrs has no judged, as each final training has"),
-        ({FINALIST: 0}, "has no judged_seed"),
-        ({FINALIST: 0, FINAL_SEED: 3}, "has no figures"),
+        ({FINAL_SEED: 3}, r"a.trials\[0\].user_attrs lacks judged, which each final training has"),
+        ({FINALIST: 0}, "lacks judged_seed"),
+        ({FINALIST: 0, FINAL_SEED: 3}, "lacks figures"),
         (
             {FINALIST: -2, FINAL_SEED: 3, METRICS: {}},
             "judged is -2, but it must be a whole number of at least 0, or -1",
         ),
-        ({FINALIST: 7, FINAL_SEED: 3, METRICS: {}}, "judged is 7, but it must be the number of one of 4 trials"),
+        (
+            {FINALIST: 7, FINAL_SEED: 3, METRICS: {}},
+            "judged is 7, but it must be -1 for the control, or the number of one of 4",
+        ),
     ],
 )
 def test_final_training_of_nothing_is_refused(attributes, line):

@@ -76,7 +76,7 @@ def test_journal_that_is_torn_while_others_have_it_open_is_mended_by_the_next_to
     [
         ("mysql://a@b/c", "study.storage is 'mysql://a@b/c', but it must be a file, sqlite:///FILE or postgres"),
         ("/dev/null/a", "study.storage is '/dev/null/a', but no file can be used there"),
-        ("", "but no file can be used there (what is there is no file)"),
+        ("", "but no file can be used there (it is not a regular file)"),
         ("/proc/a", "study.storage is '/proc/a', but no file can be used there"),
         ("sqlite:////proc/a", "study.storage is 'sqlite:////proc/a', but no file can be used there"),
         ("sqlite:////dev/null/a", "study.storage is 'sqlite:////dev/null/a', but no file can be used there"),

@@ -498,5 +498,6 @@ def test_difference_that_is_the_same_everywhere_has_no_interval_to_speak_of():
     )
     assert (
         judgement.statement
-        == "Trial 3 was chosen; its difference to the control is 100.0% in all (success, by reward)."
+        == "Trial 3 was chosen; its difference from the control is 100.0% for every seed and volume "
+        "(success, by reward)."
     )

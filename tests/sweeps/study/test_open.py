@@ -9,7 +9,7 @@ from armscan.errors import StudyError, TrackingError
 from armscan.sweeps.storage.attribute_names import NOTE_SUM, STUDY_RUN
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.dashboard import note_run
-from armscan.sweeps.study.open import OWNER_FILE, _own
+from armscan.sweeps.study.open import OWNER_FILE, _claim_folder
 from armscan.sweeps.study.study import make_study
 from tests.sweeps.study.test_study import settings
 
@@ -133,4 +133,4 @@ def test_folder_that_an_earlier_version_has_given_another_study_is_refused(tmp_p
     study = make_study(open_storage(storage_uri), settings(storage=storage_uri), {})
     (tmp_path / "shared" / "trials").mkdir(parents=True)
     with pytest.raises(StudyError, match="which has the files of another study"):
-        _own(tmp_path / "shared", study)
+        _claim_folder(tmp_path / "shared", study)
