@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar
 
-from armscan.agents.networks import NetworkChoice, check_effects
+from armscan.agents.networks import NetworkChoice, check_network
 from armscan.agents.protocols import AgentSetup
 from armscan.errors import InvalidValueError
 from armscan.utils.validation import check_bool, check_float, check_int
@@ -61,7 +61,7 @@ class Parameters:
     """Number of training environments that are stepped side by side."""
 
     def __post_init__(self) -> None:
-        check_effects(self.network)
+        check_network(self.network)
         check_numbers_of(self)
 
     def lr_after(self, n_env_steps: int, total_env_steps: int) -> float:

@@ -100,8 +100,8 @@ class NetworkByObservation:
     """
 
     def __init__(self, vector: NetworkChoice, images: NetworkChoice) -> None:
-        self.vector = check_effects(vector, "network.vector")
-        self.images = check_effects(images, "network.images")
+        self.vector = check_network(vector, "network.vector")
+        self.images = check_network(images, "network.images")
 
     def for_space(self, observation_space: spaces.Space[Any]) -> Network:
         """See `NetworkChoice.for_space`."""
@@ -114,7 +114,7 @@ def is_vector(space: spaces.Space[Any]) -> bool:
     return isinstance(space, spaces.Box) and len(space.shape) == 1
 
 
-def check_effects(network: NetworkChoice, name: str = "network") -> NetworkChoice:
+def check_network(network: NetworkChoice, name: str = "network") -> NetworkChoice:
     """Check that an object is a network, or a choice between networks, and return it.
 
     Args:

@@ -66,7 +66,7 @@ def run_study(arguments: Sequence[str], launch: Callable[[Sequence[str]], object
             print_sentence(printable(each.message))
     if reopen(search.study, search.storage, settings.asked):
         print(f"{settings.name}: had ended by itself, going on")
-    blocked = [] if opened.final_eval is None else [study.study_name for study in opened.final_eval.blocked()]
+    blocked = [] if opened.final_eval is None else opened.final_eval.blocked()
     for phase in opened.phases:
         if phase.scheduler.resume():
             print(f"{phase.name}: was stopped, resuming")

@@ -93,7 +93,7 @@ def _print_replay(opened: OpenedStudy) -> None:
 def _print_final_results(opened: OpenedStudy, final: FinalEvaluation) -> int:
     """Print how a configuration was chosen, and its results on the test volumes; return the exit code."""
     trials = opened.search.scheduler.study.get_trials(deepcopy=False)
-    unfinished, blocked = os.EX_TEMPFAIL, [study.study_name for study in final.blocked()]
+    unfinished, blocked = os.EX_TEMPFAIL, final.blocked()
     for phase in opened.finals:
         check_trials(phase.scheduler.study, n_searched=len(trials))
         if failed := phase.scheduler.failures(phase.scheduler.state()):

@@ -112,8 +112,10 @@ class TrialScheduler:
 
     def _drop_waiting(self) -> None:
         """Fail the waiting trials that are not wanted any more; they count nowhere."""
-        # A search reads its trials only once for a claim.
-        for trial in filterfalse(self._is_current, self.state().waiting) if self._is_current else ():
+        if self._is_current is None:
+            # A search reads its trials only once for a claim.
+            return
+        for trial in filterfalse(self._is_current, self.state().waiting):
             self.study._storage.set_trial_user_attr(trial._trial_id, RETRIED, True)
             self.study._storage.set_trial_user_attr(trial._trial_id, FAILURE, "the study has another configuration")
             self.study._storage.set_trial_state_values(trial._trial_id, TrialState.FAIL)

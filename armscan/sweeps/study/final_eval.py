@@ -177,7 +177,7 @@ class FinalEvaluation:
                 continue
             if trial.state == TrialState.COMPLETE:
                 scores[number][seed] = self.sign * trial.values[0]
-            elif trial.state in ENDED_WITHOUT_SCORE and RETRIED not in trial.user_attrs:
+            elif _has_no_score(trial):
                 scores[number].setdefault(seed, math.nan)
         return scores
 
@@ -247,16 +247,15 @@ class FinalEvaluation:
         counted = self._counted_trials(self.judgement)
         return {training_of(trial): trial for trial in counted if trial.state == TrialState.COMPLETE}
 
-    def blocked(self) -> list[optuna.Study]:
-        """Return the studies that failed trainings block: without a choice, or without a seed of the judgement."""
-        race, found = self.race(), []
-        if race.is_over and race.chosen is None:
-            found.append(self.selection)
-        wanted = self.trainings_of_judgement(race)
-        trials = [trial for trial in self._counted_trials(self.judgement) if training_of(trial) in wanted]
-        if any(trial.state in ENDED_WITHOUT_SCORE and RETRIED not in trial.user_attrs for trial in trials):
-            found.append(self.judgement)
-        return found
+    def blocked(self) -> list[str]:
+        """Return the names of the studies that failed trainings block: without a choice, or a seed of the judgement."""
+        race = self.race()
+        wanted, ended = self.trainings_of_judgement(race), filter(_has_no_score, self._counted_trials(self.judgement))
+        is_blocked = {
+            self.selection.study_name: race.is_over and race.chosen is None,
+            self.judgement.study_name: any(training_of(trial) in wanted for trial in ended),
+        }
+        return [name for name in is_blocked if is_blocked[name]]
 
     def _planned(self, trainings: Iterable[tuple[int, int]], study: optuna.Study) -> list[PlannedTrial]:
         begun = set(map(training_of, self._counted_trials(study)))
@@ -284,6 +283,10 @@ class FinalEvaluation:
         ignored = study.user_attrs.get(RESET_FAILURES, ())
         trials = study.get_trials(deepcopy=False)
         return [trial for trial in trials if trial.number not in ignored and self.is_current(trial)]
+
+
+def _has_no_score(trial: FrozenTrial) -> bool:
+    return trial.state in ENDED_WITHOUT_SCORE and RETRIED not in trial.user_attrs
 
 
 def _config_sha256(search: optuna.Study) -> str:

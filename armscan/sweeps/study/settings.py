@@ -89,8 +89,8 @@ MeanSeeds = Annotated[int, Field(ge=1, le=MAX_MEAN_SEEDS, description=f"a whole 
 class FinalEvalSettings(Section):
     """Settings of the final evaluation, which selects one of the best configurations and compares it with the control.
 
-    The control is the configuration of the study without the searched values. The selection and the
-    judgement have seeds of their own, which the search does not use.
+    The control is the configuration of the study without the searched values. The selection and the judgement have
+    seeds of their own, which the search does not use.
 
     Args:
         top_k: Number of candidates, the best different configurations of the search, 0 or more; 0 for no final

@@ -430,7 +430,7 @@ def test_final_evaluation_that_failed_is_run_again_once_it_is_started_again(stor
         # Too few failures to end the study.
         scheduler.renew(trial, {"env_steps": 100})
         fail(scheduler, trial, "the disk was full")
-    assert [each.study_name for each in final.blocked()] == [scheduler.study.study_name]
+    assert final.blocked() == [scheduler.study.study_name]
     n_failed = len(scheduler.state().failed)
     assert scheduler.reset_failures() == 0
     assert scheduler.reset_failures(is_blocked=True) == n_failed
