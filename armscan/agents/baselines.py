@@ -51,9 +51,9 @@ class Exhaustive:
     """All planes in fixed steps, from the middle of the swept components' ranges outward.
 
     The middle is a rotation of 0 and half the bound of a translation. Each plane is visited once, in order of its
-    distance from the middle, counted in steps; ties go to the smaller component. No plane lies between the last step
-    within the range and its end. If all planes were visited and none ended the episode, the agent stays at the one with
-    the best reward. Where an episode ends only after a number of steps, the last step takes that plane, too.
+    distance from the middle, counted in steps; ties go to the smaller component. The sweep ends at the last whole step
+    within the range. If all planes were visited and none ended the episode, the agent stays at the one with the best
+    reward. If success does not end an episode (`env.ends`), step `env.max_steps` returns to that plane, too.
 
     Components that are free but not swept are held at 0 degrees or 0 mm: the plane straight across the arm with the
     whole hand in the picture. (The middle of tx, normalised 0, would push half of the hand out of it.) The agent never

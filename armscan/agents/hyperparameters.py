@@ -74,7 +74,7 @@ class PolicyParameters(Parameters):
     """Hyperparameters of every algorithm whose policy explores while it learns."""
 
     deterministic_eval: bool = True
-    """Whether evaluations use the mode of the policy. False: they sample actions, as training does."""
+    """Whether evaluations take deterministic actions, see `Policy`. False: they sample actions, as training does."""
 
 
 def round_up(n_env_steps: int, num_envs: int) -> int:

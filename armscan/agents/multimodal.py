@@ -35,7 +35,8 @@ class Multimodal:
         head_sizes: Units of each hidden layer of the head.
 
     Raises:
-        InvalidValueError: If there is no size, or one is not a whole number of at least 1.
+        InvalidValueError: If `filters` is not three whole numbers from 1 to 4096, or another list is empty or holds
+            anything but whole numbers from 1 to 16,384.
     """
 
     def __init__(

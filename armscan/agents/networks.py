@@ -58,7 +58,7 @@ class MLP:
         activation: Name of the `torch.nn` layer after each hidden layer.
 
     Raises:
-        InvalidValueError: If a size is not a whole number of at least 1, or the activation is unknown.
+        InvalidValueError: If a size is not a whole number from 1 to 16,384, or the activation is unknown.
     """
 
     def __init__(self, hidden_sizes: Sequence[int] = (64, 64), activation: str = "relu") -> None:

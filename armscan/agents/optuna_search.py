@@ -26,8 +26,8 @@ class OptunaSearch:
 
     Each episode is a new study in memory. The reward of the start is not passed on, because no agent is told which
     plane the start is. The named sampler proposes every plane, even with one free component, for which CMA-ES in
-    earlier versions of Optuna fell back to random planes. Where an episode ends only after a number of steps, the last
-    step takes the best plane.
+    earlier versions of Optuna fell back to random planes. If success does not end an episode (`env.ends`), step
+    `env.max_steps` returns to the best plane.
 
     Raises:
         InvalidValueError: If a value is impossible.

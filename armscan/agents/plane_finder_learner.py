@@ -59,9 +59,11 @@ class PlaneFinderLearner(SupervisedLearner):
         setup.compute.apply_to(network)
         self._calibration_envs = setup.make_validation_envs and setup.make_validation_envs(N_CALIBRATION)
         self.expected_error: tuple[float, float] | None = None
-        """Expected errors of the plane that `act` chose last, in mm and degrees; None if it is not this network's."""
+        """Expected errors of the plane that `act` chose last, in mm and degrees; None before the first, and if SAC has
+        corrected the plane."""
         self.expected_errors: NDArray[Any] = np.empty((0, 2))
-        """Expected errors of the planes that `act_all` chose last in each episode, shape (n, 2), or None."""
+        """Expected errors of the planes that `act_all` chose last in each episode, shape (n, 2); None for an episode
+        without."""
 
     @property
     def env_steps_at_once(self) -> int:

@@ -18,7 +18,9 @@ ObservationTensors = torch.Tensor | dict[str, torch.Tensor]
 
 
 class Policy(nn.Module):
-    """A copy of a learner's actor, in 32 bits on the CPU, that returns the mean of its actions.
+    """A copy of a learner's actor, in 32 bits on the CPU, that returns its deterministic actions.
+
+    A deterministic action is the mean of the actor's Gaussian, squashed (SAC) or clipped (PPO) to [-1, 1].
 
     Args:
         actor: Actor that returns mean and spread of the actions.
@@ -38,7 +40,7 @@ class Policy(nn.Module):
         super().__init__()
         self.actor = plain_copy(actor).eval().requires_grad_(requires_grad=False)
         self._bounded = bounded
-        self.differs = "the agent draws its actions, of which this is the most likely one" if is_sampling else None
+        self.differs = "the agent samples its actions, and this is the deterministic one" if is_sampling else None
         """Reason why the learner's own `act` may give other numbers; None if it gives the same."""
         if self.differs is None and not compute.is_float32_on_cpu:
             self.differs = f"the agent has computed with {compute.precision} on {compute.torch_device}"

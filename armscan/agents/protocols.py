@@ -63,7 +63,10 @@ class Learner(Agent, Protocol):
         """Take the steps that come before the first update; called once, at the very beginning."""
 
     def learn(self, n_env_steps: int) -> dict[str, float]:
-        """Learn for `n_env_steps`, or slightly more; return its training metrics by name."""
+        """Learn for one epoch of about `n_env_steps`, see `env_steps_at_once`; return its training metrics by name.
+
+        It takes more steps to end with a whole collection, and fewer where a phase of the training ends.
+        """
 
     def policy(self) -> Policy:
         """Return a copy of the module that `act` computes with, for batches; later learning does not change it."""
@@ -98,7 +101,7 @@ class AgentSetup:
         n_steps: Number of steps of an episode that does not end at its first success; its last plane is the answer.
             Default: None, episodes end at the first success.
         make_validation_envs: Factory of environments on the validation volumes, for learners that fit parameters there.
-            Default: None, for an agent that does not learn.
+            Default: None, for an agent that is not trained here, such as one that is evaluated.
     """
 
     make_envs: VectorEnvFactory

@@ -28,7 +28,7 @@ LOG_SPREADS = (-2.5, -0.5)
 
 
 class RegressionLearner(SupervisedLearner):
-    """Fits a network to the optimal actions of observed planes; default: random planes.
+    """Fits a network to the optimal actions of observed planes: random ones, and a share of its own.
 
     Args:
         network: Kind of network; the mean of its actor's actions is fitted.

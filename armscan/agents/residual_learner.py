@@ -122,7 +122,7 @@ class ResidualLearner(PlaneFinderLearner):
             raise DivergedError(_of_sac(error)) from error
 
     def act(self, observation: Observed, reward: float) -> FloatArray:
-        """Return the next plane, shape (n_action,); the errors of corrected planes are not expected."""
+        """Return the next plane, shape (n_action,); set `expected_error` to None once SAC corrects the planes."""
         action = super().act(observation, reward)
         if self._corrected.is_corrected:
             # Those of the plane finder are calibrated on the planes before their correction.

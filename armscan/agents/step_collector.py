@@ -28,7 +28,7 @@ Actions = NDArray[np.float32]
 class StepCollector(Collector[CollectStats]):
     """Tianshou's collector, which collects steps of Gaussian policies as arrays, with the same result to the bit.
 
-    Only lengths differ: an episode of which the buffer no longer holds all transitions counts in full.
+    Only episode lengths differ: they count every step, even if the buffer no longer holds all transitions.
 
     Tianshou makes some 7,000 Python calls for a step of all environments, most of them for a `Batch` that is made only
     to be copied into the replay buffer. `collect` and `_is_plain` decide when arrays are used.

@@ -29,7 +29,7 @@ class TianshouVectorEnv(BaseVectorEnv):
 
     Attributes:
         n_ended: Number of episodes that have ended since it was set to 0.
-        n_successes: Number of these episodes that ended on a rewarded plane.
+        n_successes: Number of these episodes that ended in success.
     """
 
     def __init__(self, envs: VectorEnv[Any, Any, Any]) -> None:

@@ -183,7 +183,7 @@ class TianshouLearner(BaseLearner):
         return self._inference.actions(observations, episodes)
 
     def policy(self) -> Policy:
-        """Return a copy of the actor that `act` uses; it returns the mode of the actions."""
+        """Return a copy of the actor that `act` uses; it returns deterministic actions."""
         policy = self._algorithm.policy
         return Policy(policy.actor, self._bounded, self._compute, is_sampling=not policy.deterministic_eval)
 

@@ -40,8 +40,8 @@ class FoundPlane:
         action: Plane that was found; its origin (tx, ty) lies within the volume.
         score: Reward of the plane, in [-1, 0].
         counts: Number of clusters of bones, tendons and artery in its slice.
-        spread: Extent of the planes with the best score, end to end: (rz, rx) in degrees and along the arm in mm; None
-            for a plane that a person drew.
+        spread: Extent of the largest connected region of planes with the best score, end to end: (rz, rx) in degrees
+            and along the arm in mm; None for a plane that a person drew.
     """
 
     action: ManipulatorAction
@@ -124,21 +124,23 @@ def find_optimal_plane(
     targets: Sequence[int] = PUBLISHED_TARGETS,
     clustering: str | Tissues = "pixels",
 ) -> FoundPlane:
-    """Find the plane in the middle of those with the best landmark reward.
+    """Find the plane in the middle of the largest connected region of planes with the best landmark reward.
 
     A plane that the volume is already labelled with is ignored. If the best planes extend beyond the rotation limits,
     the middle is taken of the part within.
 
     Args:
         volume: Volume to search, over its whole length.
-        rz_deg: Largest rotation about Z to try, in degrees, in both directions, at most 80.
-        rx_deg: Largest rotation about X to try, in degrees, in both directions, at most 80.
+        rz_deg: Largest rotation about Z to try, in degrees, in both directions, from 0 to 80. Default: 45.
+        rx_deg: Largest rotation about X to try, in degrees, in both directions, from 0 to 80. Default: 20.
         step_deg: Step between rotations in the first search, in degrees; half of it around the region with the best
-            score.
+            score. Default: 5.
         step_mm: Step along the arm in the first search, in mm; half of it around the region with the best score.
-        success_threshold: Threshold of success: a plane counts as found if it scores above -success_threshold.
-        targets: Target counts of the reward.
-        clustering: Clustering rules: `pixels`, `metric`, or an `armscan.anatomy.Tissues`.
+            Default: 3.
+        success_threshold: Threshold of success: a plane counts as found if it scores above -success_threshold. Default:
+            0.05.
+        targets: Target counts of the reward. Default: (4, 3, 1).
+        clustering: Clustering rules: `pixels`, `metric`, or an `armscan.anatomy.Tissues`. Default: `pixels`.
 
     Returns:
         The plane with its score.

@@ -15,7 +15,7 @@ from armscan.anatomy import SUCCESS_THRESHOLD, Tissues, check_tissues
 from armscan.envs.actions import COMPONENTS
 from armscan.envs.observations import View
 from armscan.envs.panels import BACKGROUND, INK, LINE_INK, OPTIMUM_INK, PLANE_INK, Ink
-from armscan.envs.rendering import HEIGHT, WIDTH, Box, History, ReferencePlane, draw_plane, view_of
+from armscan.envs.rendering import HEIGHT, WIDTH, Box, ReferencePlane, RewardHistory, draw_plane, view_of
 from armscan.envs.rules import Volumes, named_volumes
 from armscan.envs.scene import SceneSampler
 from armscan.envs.window import check_display, picture_figure
@@ -114,7 +114,9 @@ class Explorer:
             self.plane,
             self.view,
             beside=None if self.optimum is None else ReferencePlane(self.optimum, "optimal plane"),
-            history=History(remembered, range(first, first + N_REMEMBERED), -SUCCESS_THRESHOLD, "reward by plane"),
+            history=RewardHistory(
+                remembered, range(first, first + N_REMEMBERED), -SUCCESS_THRESHOLD, "reward by plane"
+            ),
         )
 
     def _look(self, _: float = 0.0) -> None:

@@ -82,7 +82,7 @@ OPTIONS = {
 @click.option(
     "--deterministic-eval/--no-deterministic-eval",
     default=None,
-    help="Take the policy's mean action, or sample its actions.",
+    help="Take the policy's deterministic action, or sample its actions.",
 )
 @click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), help="Device on which the network computes.")
 @tracking_option(help="MLflow tracking store of the run and of the evaluation.")

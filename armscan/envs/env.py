@@ -27,7 +27,8 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
 
     ## Description
     An episode uses one volume, drawn at random and moved by a random `transform`. Each action places the plane
-    (absolute, not relative to the last one). The environment samples the slice and clusters its landmarks.
+    (absolute, not relative to the last one). The environment samples the slice and clusters its landmarks. The optimal
+    plane is the labelled plane of the volume, moved with the volume.
 
     ## Action space
     `Box(-1, 1, (n_action,))`: the free components of (rz, rx, tx, ty), normalised. Rotations are a * bound degrees,
@@ -93,7 +94,8 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
         max_steps: Number of steps after which an episode is truncated, 1 or more. Default: 50.
         start: Plane at the start, `middle` or `random`. Default: `middle`.
         rotation_bounds_deg: Bounds of rz and rx in degrees, each in [0, 180]. Default: (180, 180).
-        translation_bounds_mm: Bounds of tx and ty in mm. Default: None, the size of the current volume.
+        translation_bounds_mm: Bounds of tx and ty in mm, each in [0, 1e6]. Default: None, the size of the current
+            volume.
         transform: Random motion of the volume at each reset. Default: `RandomTransform()`; None: no motion.
 
     Raises:

@@ -14,7 +14,7 @@ from armscan.errors import InvalidValueError, listed
 from armscan.utils.validation import check_int
 
 FLAT = ""
-"""Name of a flat observation among parts."""
+"""Key in `Parts` of an observation that is one vector."""
 
 MEMORY = "memory"
 # Observations of a stack, and pairs of a memory.
@@ -126,7 +126,10 @@ class FrameHistory:
             frames[env_ids, latest] = parts[name]
 
     def added_to(self, parts: Parts, env_ids: EnvIds) -> Parts:
-        """Return the latest observations; stacked parts have the shape (n_envs, size, ...)."""
+        """Return the latest observations of these n environments; stacked parts have the shape (n, size, ...).
+
+        A stacked vector has the shape (n, size * length).
+        """
         places = self._places[self._latest[env_ids]]
         return {
             name: self._stack(name, env_ids, places) if name in self._frames else part for name, part in parts.items()
@@ -152,7 +155,7 @@ class BestPairs:
     Args:
         boxes: Space of each part of one environment.
         size: Number of pairs of action and reward, from 1 to 1000.
-        action_space: Space of an action's free components.
+        action_space: Space of one action, `stop` included.
         n_envs: Number of environments of the batch.
     """
 
@@ -160,9 +163,9 @@ class BestPairs:
         check_int("memory", size, at_least=1, at_most=MAX_KEPT)
         if MEMORY in boxes:
             raise InvalidValueError(f"the observation already has a part {MEMORY!r}, which BestActionMemory adds")
-        n_free = int(np.prod(action_space.shape or ()))
-        self.pairs = np.zeros((n_envs, size, n_free + 1), dtype=np.float32)
-        low, high = [-1.0] * (n_free + 1), [1.0] * n_free + [0.0]
+        n_action = int(np.prod(action_space.shape or ()))
+        self.pairs = np.zeros((n_envs, size, n_action + 1), dtype=np.float32)
+        low, high = [-1.0] * (n_action + 1), [1.0] * n_action + [0.0]
         box = spaces.Box(np.tile(low, size).astype(np.float32), np.tile(high, size).astype(np.float32))
         self.boxes = {FLAT: flat_space({**boxes, MEMORY: box})} if FLAT in boxes else {**boxes, MEMORY: box}
 

@@ -20,8 +20,8 @@ from armscan.volumes import LANDMARK_LABELS
 FULL = 255
 # Relative tolerance for the field of view to be a whole number of pixels.
 ROUNDING = 1e-6
-# For each pixel of the slice along an axis: the first pixel of the image that it overlaps, and the share of this one,
-# and of each that follows, that it covers.
+# For each pixel of the slice along an axis: the index of the first pixel of the image that it overlaps, and the
+# fractions of this and the following image pixels that it covers.
 Overlaps = tuple[NDArray[np.int64], NDArray[np.float32]]
 
 
@@ -32,11 +32,11 @@ class MetricSliceObservation:
     smoothly, and volumes of any spacing give the same image. Outside the slice it is 0.
 
     Args:
-        field_of_view_mm: Size (across, depth) of the image in mm, each above 0.
-        pixel_mm: Size (across, depth) of a pixel in mm, each above 0.
+        field_of_view_mm: Size (across, depth) of the image in mm, each above 0, at most 1e6. Default: (97.2, 44.0).
+        pixel_mm: Size (across, depth) of a pixel in mm, each above 0, at most 1e6. Default: (1.62, 1.1).
 
     Raises:
-        InvalidValueError: If a size is not above 0, or the field of view is not 1 to 4096 whole pixels each way.
+        InvalidValueError: If a size is out of range, or the field of view is not 1 to 4096 whole pixels each way.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class MetricSliceObservation:
         self._shape = round(sides[0]), round(sides[1])
         self._overlaps: dict[SliceGeometry, tuple[Overlaps, Overlaps]] = {}
 
-    def spaces(self, geometries: Sequence[SliceGeometry], n_free: int) -> dict[str, spaces.Box]:
+    def spaces(self, geometries: Sequence[SliceGeometry], n_action: int) -> dict[str, spaces.Box]:
         """See `Observation.spaces`."""
         return {"shares": spaces.Box(0, FULL, (len(LANDMARK_LABELS), *self._shape), np.uint8)}
 

@@ -45,7 +45,7 @@ class MergedObservation:
             for member in (each.observations if isinstance(each, MergedObservation) else (each,))
         )
 
-    def spaces(self, geometries: Sequence[SliceGeometry], n_free: int) -> dict[str, spaces.Box]:
+    def spaces(self, geometries: Sequence[SliceGeometry], n_action: int) -> dict[str, spaces.Box]:
         """See `Observation.spaces`.
 
         Raises:
@@ -53,7 +53,7 @@ class MergedObservation:
         """
         merged: dict[str, spaces.Box] = {}
         for observation in self.observations:
-            parts = observation.spaces(geometries, n_free)
+            parts = observation.spaces(geometries, n_action)
             if twice := sorted(merged.keys() & parts.keys()):
                 raise InvalidValueError(f"merged observations both have the key {listed(twice)}")
             merged.update(parts)

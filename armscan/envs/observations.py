@@ -44,8 +44,8 @@ class View:
         landmarks: Summary of its clusters, shape (3, 4).
         tissues: Clustering rule of each tissue.
         geometry: Shape and pixel size of the slice.
-        smallest_shape: Smallest slice of all volumes, (across, depth) in pixels.
-        action: Free components of the last action, normalised, shape (n_free,).
+        smallest_shape: Largest shape that fits into the slices of all volumes, (across, depth) in pixels.
+        action: Last action, normalised, shape (n_action,): its free components, and `stop` if `ends` is `on_stop`.
         reward: Reward of the slice, in [-1, 0].
     """
 
@@ -66,8 +66,8 @@ class View:
 class Observation(Protocol):
     """A set of named parts that the agent sees; implement both methods for an observation of your own."""
 
-    def spaces(self, geometries: Sequence[SliceGeometry], n_free: int) -> dict[str, spaces.Box]:
-        """Return the space of each part, for every geometry that can occur and `n_free` action components."""
+    def spaces(self, geometries: Sequence[SliceGeometry], n_action: int) -> dict[str, spaces.Box]:
+        """Return the space of each part, for every geometry that can occur and actions of `n_action` components."""
 
     def observe(self, view: View) -> Parts:
         """Return the value of each part, within its space, in arrays that are not reused."""
@@ -87,12 +87,12 @@ def observe_all(observation: Observation, views: Sequence[View]) -> Parts:
 
 
 class ActionRewardObservation:
-    """The last normalised action, shape (n_free,), and the reward of the current slice, shape (1,)."""
+    """The last normalised action, shape (n_action,), and the reward of the current slice, shape (1,)."""
 
-    def spaces(self, geometries: Sequence[SliceGeometry], n_free: int) -> dict[str, spaces.Box]:
+    def spaces(self, geometries: Sequence[SliceGeometry], n_action: int) -> dict[str, spaces.Box]:
         """See `Observation.spaces`."""
         return {
-            "action": spaces.Box(-1.0, 1.0, (n_free,), np.float32),
+            "action": spaces.Box(-1.0, 1.0, (n_action,), np.float32),
             "reward": spaces.Box(-1.0, 0.0, (1,), np.float32),
         }
 
@@ -113,8 +113,7 @@ class ClusterObservation:
 
     In the normalised form, counts are divided by their targets, pixels by the tissue's typical area, and the centre's
     offset from the slice's middle by (25, 12) mm; all are 0 if the tissue is absent, and near [-1, 1] otherwise. The
-    raw form has the plain numbers, the centre in pixels. Agents learn in a minute with the normalised form what they
-    never learn with the raw one.
+    raw form has the plain numbers, the centre in pixels. Agents learn much faster with the normalised form.
 
     Args:
         normalised: Whether to return the normalised form; False: the raw one. Default: True.
@@ -126,7 +125,7 @@ class ClusterObservation:
         self._targets = check_targets(targets)
         self._scales: dict[SliceGeometry, tuple[FloatArray, FloatArray]] = {}
 
-    def spaces(self, geometries: Sequence[SliceGeometry], n_free: int) -> dict[str, spaces.Box]:
+    def spaces(self, geometries: Sequence[SliceGeometry], n_action: int) -> dict[str, spaces.Box]:
         """See `Observation.spaces`."""
         most = [self._features(_most_landmarks(geometry)[None], geometry) for geometry in geometries]
         highest = np.max(most, axis=0).reshape(-1, 4)

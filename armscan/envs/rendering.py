@@ -48,7 +48,7 @@ class ReferencePlane(NamedTuple):
     name: str
 
 
-class History(NamedTuple):
+class RewardHistory(NamedTuple):
     """Rewards up to the current plane, each in [-1, 0], the numbers on the horizontal axis, the goal, and a title."""
 
     rewards: Sequence[float]
@@ -66,7 +66,7 @@ def draw_frame(episode: Episode) -> NDArray[np.uint8]:
         episode.view,
         transform=scene.transform,
         beside=ReferencePlane(scene.optimum, "optimal plane"),
-        history=History(episode.rewards, range(rules.max_steps + 1), -rules.success_threshold, "reward by step"),
+        history=RewardHistory(episode.rewards, range(rules.max_steps + 1), -rules.success_threshold, "reward by step"),
         caption=f"step {episode.n_steps}",
     )
 
@@ -78,7 +78,7 @@ def draw_plane(
     *,
     transform: RigidTransform | None = None,
     beside: ReferencePlane | None = None,
-    history: History | None = None,
+    history: RewardHistory | None = None,
     caption: str = "",
 ) -> NDArray[np.uint8]:
     """Draw a plane: its slice, the volume from two sides, its reward.

@@ -36,18 +36,19 @@ class RandomTransform:
     larger landmarks, in pixels as in mm.
 
     Args:
-        rz_deg: Largest rotation about Z, in degrees, in both directions, from 0 to 180.
-        rx_deg: Largest rotation about X, in degrees, in both directions, from 0 to 180.
-        tx_mm: Largest translation along X, in mm, in both directions, from 0 to 10,000.
-        ty_mm: Largest translation along Y, in mm, in both directions, from 0 to 10,000.
+        rz_deg: Largest rotation about Z, in degrees, in both directions, from 0 to 180. Default: 10.
+        rx_deg: Largest rotation about X, in degrees, in both directions, from 0 to 180. Default: 0.
+        tx_mm: Largest translation along X, in mm, in both directions, from 0 to 10,000. Default: 10.
+        ty_mm: Largest translation along Y, in mm, in both directions, from 0 to 10,000. Default: 10.
         centre: Fixed point of the rotation: `middle` of the volume, or `first_voxel`, as published, which moves the
-            hand out of the picture.
-        scale: Largest relative change of the volume's size, the same in all directions, from 0 to 0.3.
+            hand out of the picture. Default: `middle`.
+        scale: Largest relative change of the volume's size, the same in all directions, from 0 to 0.3. Default: 0.
         stretch: Largest relative change of its size across, along the labelled normal and in depth, each drawn
-            separately, from 0 to 0.3.
+            separately, from 0 to 0.3. Default: 0.
         shear: Largest shear, in mm of shift per mm along another axis, from 0 to 0.3: across and depth shift with the
-            position along the labelled normal, and with each other.
-        mirror: Whether to mirror an episode's volume, so that it shows the other hand, with probability 0.5.
+            position along the labelled normal, and with each other. Default: 0.
+        mirror: Whether to mirror an episode's volume, so that it shows the other hand, with probability 0.5. Default:
+            False.
     """
 
     rz_deg: float = 10.0

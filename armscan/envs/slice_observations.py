@@ -40,8 +40,8 @@ class _FramedSlice:
         smallest = smallest_shape([each.shape for each in geometries])
         if self._crop is not None and (self._crop[0] > smallest[0] or self._crop[1] > smallest[1]):
             raise InvalidValueError(
-                f"crop is {self._crop}, but it must be at most {smallest}, the smallest slice (across, depth) of the "
-                "volumes"
+                f"crop is {self._crop}, but it must be at most {smallest}, which fits into the slices (across, depth) "
+                "of all volumes"
             )
         return self._shape or self._crop or smallest
 
@@ -78,7 +78,7 @@ class SliceObservation(_FramedSlice):
         InvalidValueError: If a shape is not two whole numbers from 1 to 4096.
     """
 
-    def spaces(self, geometries: Sequence[SliceGeometry], n_free: int) -> dict[str, spaces.Box]:
+    def spaces(self, geometries: Sequence[SliceGeometry], n_action: int) -> dict[str, spaces.Box]:
         """See `Observation.spaces`."""
         return {"slice": spaces.Box(0, max(LABEL_NAMES), self._observed_shape(geometries), np.uint8)}
 
@@ -106,7 +106,7 @@ class SliceChannelsObservation(_FramedSlice):
         InvalidValueError: If a shape is not two whole numbers from 1 to 4096.
     """
 
-    def spaces(self, geometries: Sequence[SliceGeometry], n_free: int) -> dict[str, spaces.Box]:
+    def spaces(self, geometries: Sequence[SliceGeometry], n_action: int) -> dict[str, spaces.Box]:
         """See `Observation.spaces`."""
         shape = (len(LANDMARK_LABELS), *self._observed_shape(geometries))
         return {"channels": spaces.Box(0, 1, shape, np.uint8)}

@@ -29,9 +29,9 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
     the caller resets finished ones by `reset(options={"reset_mask": mask})`.
 
     Args:
-        num_envs: Number of environments, 1 or more.
+        num_envs: Number of environments, from 1 to 65,536. Default: 1.
         volumes: Volumes of the environments; see `ArmscanEnv`. Default: None, four phantoms.
-        autoreset_mode: Autoreset mode of Gymnasium, `NextStep` or `Disabled`.
+        autoreset_mode: Autoreset mode of Gymnasium, `NextStep` or `Disabled`. Default: `NextStep`.
         render_mode: Must be None: rendering is not supported.
         **rules: The other arguments of `ArmscanEnv`.
 

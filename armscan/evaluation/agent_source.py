@@ -23,15 +23,15 @@ PATHS = ("path", "cache_dir")
 
 
 @dataclass(frozen=True)
-class TrainedAgent:
-    """An agent to evaluate.
+class EvaluatedAgent:
+    """Configuration of an agent to evaluate, and its weights if a run has trained it.
 
     Args:
         name: Name of the agent in tables and files.
         config: Resolved configuration, with the requested changes.
         run: Run that trained it; None for an agent without a run.
         weights: Weights of a learner; None if its run has none.
-        n_env_steps: Environment steps that it was trained for.
+        n_env_steps: Environment steps at the end of its best epoch, which the weights are from. Default: 0.
         domain: Training domain; None if its run has none.
         volumes: Fingerprints of its run's volumes; None if the run has none.
     """
@@ -45,7 +45,7 @@ class TrainedAgent:
     volumes: Fingerprints | None = field(default=None, repr=False)
 
 
-def agent_of_run(tracking: str, run_id: str, changes: Mapping[str, Any], *, trust: bool = False) -> TrainedAgent:
+def agent_of_run(tracking: str, run_id: str, changes: Mapping[str, Any], *, trust: bool = False) -> EvaluatedAgent:
     """Return the agent of a tracked run.
 
     Args:
@@ -64,10 +64,10 @@ def agent_of_run(tracking: str, run_id: str, changes: Mapping[str, Any], *, trus
         # Older runs of learners have them in the checkpoint only.
         volumes = run.volumes(Path(folder)) or facts.get("volumes") or None
     domain = TrainingDomain.from_json(run.tags[DOMAIN_TAG]) if DOMAIN_TAG in run.tags else None
-    return TrainedAgent(run.name, config, run, weights, int(facts.get("n_env_steps", 0)), domain, volumes)
+    return EvaluatedAgent(run.name, config, run, weights, int(facts.get("n_env_steps", 0)), domain, volumes)
 
 
-def agent_of_overrides(words: Sequence[str], folder: str | None, changes: Mapping[str, Any]) -> TrainedAgent:
+def agent_of_overrides(words: Sequence[str], folder: str | None, changes: Mapping[str, Any]) -> EvaluatedAgent:
     """Return the agent of a configuration, composed as `armscan run` composes it.
 
     Args:
@@ -82,7 +82,7 @@ def agent_of_overrides(words: Sequence[str], folder: str | None, changes: Mappin
         config.data.path = folder
     OmegaConf.resolve(config)
     agents = [word.partition("=")[2] for word in words if word.startswith("agent=")]
-    return TrainedAgent(agents[-1], changed(config, changes))
+    return EvaluatedAgent(agents[-1], changed(config, changes))
 
 
 def changed(config: DictConfig, changes: Mapping[str, Any]) -> DictConfig:

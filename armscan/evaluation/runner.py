@@ -12,7 +12,7 @@ from armscan.anatomy.tissues import MAX_METRIC_PIXEL_MM
 from armscan.config.command_hints import resume_command
 from armscan.envs import EnvFactory
 from armscan.errors import CheckpointError, InvalidValueError, OptimalPlaneError, listed, printable, reason_of
-from armscan.evaluation.agent_source import TrainedAgent
+from armscan.evaluation.agent_source import EvaluatedAgent
 from armscan.evaluation.volumes import (
     TrainingVolumes,
     VolumesByName,
@@ -47,7 +47,7 @@ class PreparedAgent:
         is_new: Whether the agent's run has used none of the volumes. Default: False.
     """
 
-    source: TrainedAgent
+    source: EvaluatedAgent
     agent: Agent
     envs: dict[str, Env]
     notes: tuple[str, ...]
@@ -61,7 +61,7 @@ class PreparedAgent:
 
         Args:
             n_episodes: Number of episodes.
-            seed: Seed of the first episode; the others follow from it.
+            seed: Seed of the evaluation: episode i is reset with 5,000,000 + seed + i.
             tell: Function that receives the progress. Default: none.
 
         Returns:
@@ -80,7 +80,7 @@ class PreparedAgent:
 
 
 def prepare_agent(
-    source: TrainedAgent,
+    source: EvaluatedAgent,
     data: str | None,
     n_phantoms: int,
     *,
@@ -117,7 +117,7 @@ def prepare_agent(
 
 
 def prepare_on_volumes(
-    source: TrainedAgent,
+    source: EvaluatedAgent,
     groups: Mapping[str, VolumesByName],
     own: Callable[[], Split],
     *,
@@ -178,7 +178,7 @@ def _env(env_factory: EnvFactory, volumes: VolumesByName, clustering: object, re
         ) from error
 
 
-def _load_weights(agent: Agent, source: TrainedAgent) -> None:
+def _load_weights(agent: Agent, source: EvaluatedAgent) -> None:
     if not isinstance(agent, Learner):
         return
     if source.run is None:

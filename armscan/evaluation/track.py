@@ -11,7 +11,7 @@ from typing import Any
 
 from armscan.config.defaults import to_plain
 from armscan.errors import InvalidValueError
-from armscan.evaluation.agent_source import TrainedAgent
+from armscan.evaluation.agent_source import EvaluatedAgent
 from armscan.evaluation.report import EvaluationReport
 from armscan.evaluation.runner import PreparedAgent
 from armscan.evaluation.volumes import check_out, data_name, file_name
@@ -42,7 +42,7 @@ def evaluate_and_track(
         prepared: Agent on its volumes.
         store: Config section `tracking`; used for an agent without a run.
         n_episodes: Number of episodes for each group of volumes.
-        seed: Seed of the first episode; the others follow from it.
+        seed: Seed of the evaluation, which the seeds of its episodes follow from.
         changes: Rules of the episodes that differ from the agent's configuration.
         out: JSON file to write. Default: a new one in `evaluations`.
 
@@ -98,7 +98,7 @@ def evaluate_and_track(
     return report, file
 
 
-def _store_of(source: TrainedAgent, store: Mapping[str, Any]) -> tuple[TrackingStore, str]:
+def _store_of(source: EvaluatedAgent, store: Mapping[str, Any]) -> tuple[TrackingStore, str]:
     """Return the tracking store of an evaluation, and the ID of its MLflow experiment: those of the agent's run."""
     if source.run is None:
         return open_store(**store)

@@ -23,7 +23,7 @@ def record_video(prepared: PreparedAgent, *, n_episodes: int, seed: int, out: Pa
     Args:
         prepared: Agent on its volumes; of its own volumes, only the test volumes are shown.
         n_episodes: Number of episodes for each group of volumes.
-        seed: Seed of the first episode; the others follow from it.
+        seed: Seed of the evaluation, which the seeds of its episodes follow from.
         out: Folder of the files. Default: `videos`.
 
     Returns:

@@ -12,7 +12,7 @@ from hydra.utils import instantiate
 from armscan.config.defaults import PHANTOM
 from armscan.config.error_messages import one_line_message
 from armscan.errors import InvalidValueError
-from armscan.evaluation.agent_source import TrainedAgent
+from armscan.evaluation.agent_source import EvaluatedAgent
 from armscan.training import PARTS, TEST, TRAINING, VALIDATION, Split, check_unchanged
 from armscan.utils.files import check_writable, sha256
 from armscan.volumes import LabelVolume, load_phantoms, open_dataset
@@ -26,7 +26,7 @@ MAX_PART_BYTES = 50
 VolumesByName = dict[str, LabelVolume]
 
 
-def own_split(source: TrainedAgent, parts: Sequence[str] = PARTS) -> Split:
+def own_split(source: EvaluatedAgent, parts: Sequence[str] = PARTS) -> Split:
     """Read an agent's own volumes: those that its configuration describes.
 
     Args:
@@ -55,7 +55,7 @@ def own_split(source: TrainedAgent, parts: Sequence[str] = PARTS) -> Split:
     return split
 
 
-def phantom_version(source: TrainedAgent) -> int:
+def phantom_version(source: EvaluatedAgent) -> int:
     """Return the version of the phantoms in an agent's own configuration; 1 if it names none of them."""
     named = source.config.data.get("version")
     return next((version for version in VERSIONS if version == named), 1)
@@ -115,7 +115,7 @@ def check_out(file: Path, out: Path | None, what: str) -> None:
         raise InvalidValueError(f"--out is {named!r}, but no {what} can be written there: {error.strerror}") from error
 
 
-def known_volumes(source: TrainedAgent, groups: Mapping[str, VolumesByName]) -> list[str]:
+def known_volumes(source: EvaluatedAgent, groups: Mapping[str, VolumesByName]) -> list[str]:
     """Return a sentence for each way in which an agent's run used these volumes, or others with their names.
 
     Args:

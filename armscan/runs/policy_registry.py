@@ -31,7 +31,7 @@ MAX_NAME_CHARS = 256
 CHAMPION = "champion"
 # The tag of a version that names MLflow's logged model of the same checkpoint.
 MODEL_TAG = "logged_model"
-# A policy computes its most likely action in 32 bits on the CPU, however the run trained and evaluated it.
+# A policy computes its deterministic action in 32 bits on the CPU, however the run trained and evaluated it.
 PLAIN_COMPUTE = {"device": "cpu", "precision": "float32", "compile": False}
 
 

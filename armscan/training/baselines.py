@@ -38,7 +38,7 @@ def evaluate_baselines(
     Args:
         env: Environment of the volumes.
         n_episodes: Number of episodes, in turn on the volumes.
-        seed: Seed of the first episode; the others follow from it.
+        seed: Seed of the evaluation, which the seeds of its episodes follow from.
         on_plane: Limits within which a plane counts as the labelled one. Default: those of `Evaluation`.
     """
     rules = env.get_wrapper_attr("rules")

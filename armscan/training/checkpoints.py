@@ -136,7 +136,7 @@ def _save_last(
 
 
 def _restore(learner: Learner, last: Path, provenance: CheckpointProvenance) -> list[EpochReport]:
-    """Restore a learner to the state of a checkpoint; return the reports of the epochs before it."""
+    """Restore a learner to the state of a checkpoint; return the reports of all epochs until then."""
     state, facts = load_checkpoint(last)
     provenance.check(last, facts)
     reports = _read(facts.get("reports"), last)

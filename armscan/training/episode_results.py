@@ -56,8 +56,8 @@ class EpisodeResult:
         subject: Subject of the volume. Default: None, the volume is the only one of its subject.
         seed: Seed of the reset.
         n_steps: Number of steps taken.
-        is_success: Whether the episode ended on a rewarded plane.
-        starts_solved: Whether the episode also started on a rewarded plane.
+        is_success: Whether the reward of the last plane is above -success_threshold.
+        starts_solved: Whether the reward of the first plane, before any step, is above -success_threshold.
         episode_return: Sum of the rewards.
         final_reward: Reward of the last plane.
         best_reward: Best reward of the chosen planes, without the start.
@@ -178,7 +178,7 @@ class Evaluation:
 
     @property
     def success_rate(self) -> float:
-        """Share of the episodes that ended on a rewarded plane."""
+        """Share of the episodes that ended in success: on a plane whose reward is above -success_threshold."""
         return self._mean("success_rate")
 
     @property

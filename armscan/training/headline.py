@@ -22,7 +22,7 @@ from armscan.utils.text import formatted
 
 # Metric of an agent: difference of its leading on-plane rate from random planes'.
 ABOVE_RANDOM = "on_plane_above_random"
-# With fewer test wrists, intervals are clearly too narrow: docs/metrics.md.
+# With fewer wrists, intervals are clearly too narrow: docs/metrics.md.
 MIN_WRISTS = 8
 # If the difference is the same on all volumes, only rounding gives its interval a width.
 NO_WIDTH = 1e-9

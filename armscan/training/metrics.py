@@ -52,7 +52,7 @@ class MetricEstimates:
         n_volumes: Number of volumes that they summarise.
         n_subjects: Number of their subjects, which intervals resample.
         n_episodes: Number of episodes.
-        n_started_solved: Number of episodes that started on a rewarded plane.
+        n_started_solved: Number of episodes whose first plane would already be a success.
         estimates: Metrics by name, over all episodes. Those whose names end with `_not_started_solved` are over the
             others only; those that end with `_wilson` are rates with Wilson's interval.
         on_plane: Limits of the on-plane rates, the leading ones first.

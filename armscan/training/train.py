@@ -130,7 +130,7 @@ def train(
             None, at the end of the budget.
 
     Returns:
-        The reports of all epochs.
+        The reports of all epochs, whether the task was solved, and the training time.
     """
     reports = list(earlier)
     start_s = time.perf_counter() - (reports[-1].wall_s if reports else 0.0)

@@ -27,7 +27,8 @@ class DeformingTransform(RigidTransform):
         deformation: Matrix F, shape (3, 3); its second row is zero except for the stretch along the normal.
 
     Raises:
-        InvalidValueError: If `deformation` moves the plane or is singular.
+        InvalidValueError: If `deformation` is not a finite 3 x 3 matrix, moves the plane, or is singular; or as for
+            `RigidTransform`.
     """
 
     plane: ManipulatorAction

@@ -145,7 +145,7 @@ def map_values(
 
 
 def count_values(values: NDArray[np.integer[Any]]) -> dict[int, int]:
-    """Return how many voxels have each value that occurs, in ascending order."""
+    """Return the number of voxels of each value that occurs, by value in ascending order."""
     low, high = int(values.min()), int(values.max())
     if high - low >= MAX_TABLE or high > LARGEST_INT64:
         present, n_voxels = np.unique(values, return_counts=True)

@@ -47,7 +47,8 @@ def read_segmentation(
         superior) in mm, and the segments found.
 
     Raises:
-        VolumeError: Naming the file, if it is damaged, a segment is not mapped, or segments overlap.
+        VolumeError: Naming the file, if it is damaged, a segment is not mapped, voxels belong to no segment, or
+            segments of different tissues overlap and `overlap` is `refuse`.
     """
     contents = _contents(path)
     layers = contents["voxels"]

@@ -66,7 +66,8 @@ def sample_plane(
             lies in a small part of memory.
         occupied: `occupied_depths` of the labels; pixels outside them are 0, without a lookup.
         spacing_mm: Voxel spacing (sx, sy, sz) in mm.
-        matrix: Rotation from the plane's frame into the volume's, shape (3, 3).
+        matrix: Linear map from the plane's frame into the volume's, shape (3, 3): a rotation, unless the volume is
+            deformed.
         offset_mm: Origin of the plane in the volume, in mm, shape (3,).
         slice_xz: Slice to fill, indexed [across, depth], C-contiguous.
     """

@@ -40,7 +40,7 @@ class LabelVolume:
         optimal_action: Labelled plane, in the volume's own frame.
         origin: World coordinates (LPS) of voxel (0, 0, 0), in mm. Default: zeros.
         direction: Direction cosines of the array's axes in the world, as columns, shape (3, 3). Default: the identity.
-        subject: Name of the arm, of which there may be other volumes. Default: None, this volume is the only one.
+        subject: Name of the person, of whom there may be other volumes. Default: None, this volume is the only one.
 
     Raises:
         VolumeError: Naming the volume, if the labels are not a 3-D array of the labels above, a landmark is missing,

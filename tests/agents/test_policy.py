@@ -62,14 +62,14 @@ def test_policy_is_written_as_onnx_for_batches_of_every_size(make_learner, env, 
 
 
 @pytest.mark.parametrize("algorithm", ["sac", "ppo"], indirect=True)
-def test_policy_of_a_learner_with_stochastic_evaluation_is_its_most_likely_action(make_learner, env):
+def test_policy_of_a_learner_with_stochastic_evaluation_is_its_deterministic_action(make_learner, env):
     learner = taught(make_learner(deterministic_eval=False))
     other = make_learner()
     other.load_weights(learner.weights())
     (observation,) = observed(env, 1)
     answer = learner.policy()(batch_of([observation])).numpy()[0]
     np.testing.assert_allclose(answer, other.act(observation, 0.0), rtol=0, atol=1e-6)
-    assert "draws its actions" in learner.policy().differs
+    assert "samples its actions" in learner.policy().differs
 
 
 def test_policy_computes_in_32_bits_where_the_learner_does_not(algorithm, factory_and_network, phantom, env):

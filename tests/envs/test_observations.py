@@ -140,7 +140,7 @@ def test_env_refuses_two_parts_of_one_name(wrist, observation):
 class DepthProfile:
     """A user's own observation: which share of each depth is tissue."""
 
-    def spaces(self, geometries, n_free):
+    def spaces(self, geometries, n_action):
         return {"profile": gym.spaces.Box(0, 1, (min(g.shape[1] for g in geometries),), np.float32)}
 
     def observe(self, view):
@@ -162,7 +162,7 @@ class Careless:
     def __init__(self, parts):
         self.parts = parts
 
-    def spaces(self, geometries, n_free):
+    def spaces(self, geometries, n_action):
         return {"a": spaces.Box(0, 1, (1,), np.float32), "b": spaces.Box(100, 200, (2,), np.float32)}
 
     def observe(self, view):
