@@ -28,6 +28,7 @@ MAX_PLANES = 1_000_000
 NEIGHBOURS = np.ones((3, 3, 3))
 # Rewards that differ by rounding only are the same.
 SAME_REWARD = 1e-9
+ROUNDING_DEG = 1e-6
 # Rotated further, a plane hardly crosses the arm.
 MAX_ANGLE_DEG = 80.0
 
@@ -42,12 +43,14 @@ class FoundPlane:
         counts: Number of clusters of bones, tendons and artery in its slice.
         spread: Extent of the largest connected region of planes with the best score, end to end: (rz, rx) in degrees
             and along the arm in mm; None for a plane that a person drew.
+        is_cut: Whether that region reaches a limit of the search, beyond which it may go on. Default: False.
     """
 
     action: ManipulatorAction
     score: float
     counts: tuple[int, int, int]
     spread: tuple[float, float, float] | None = None
+    is_cut: bool = False
 
 
 @dataclass(frozen=True)
@@ -178,7 +181,8 @@ def find_optimal_plane(
     plane = max(planes, key=lambda plane: scorer.score(plane)[0] >= fine_rewards.max() - SAME_REWARD)
     score, counts = scorer.score(plane)
     spread_rz, spread_rx, spread_along = (float(width) for width in np.ptp(region, axis=0) * fine.steps)
-    return FoundPlane(plane, score, counts, (spread_rz, spread_rx, spread_along))
+    is_cut = bool((np.abs(fine.pose(region)[:, :2]) >= np.array([rz, rx]) - ROUNDING_DEG).any())
+    return FoundPlane(plane, score, counts, (spread_rz, spread_rx, spread_along), is_cut)
 
 
 def largest_best_region(rewards: FloatArray) -> NDArray[np.int64]:

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from armscan.anatomy.clustering import bounding_boxes, summarise_label
 from armscan.anatomy.connected_components import WORD, IntArray, Pixels
 from armscan.anatomy.landmarks import Landmarks
-from armscan.anatomy.tissues import N_TISSUES, Tissues
+from armscan.anatomy.tissues import N_TISSUES, Neighbourhood, Tissues
+from armscan.errors import InvalidValueError
 from armscan.utils.arrays import FloatArray
 from armscan.utils.compilation import cached_njit
 from armscan.volumes.plane import ManipulatorAction
@@ -86,6 +87,13 @@ def _threads(pid: int, n_threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(n_threads, thread_name_prefix=f"scanner-{pid}")
 
 
+def _neighbourhoods(volume: LabelVolume, tissues: Tissues) -> list[Neighbourhood]:
+    try:
+        return [tissue.neighbourhood(volume.pixel_mm) for tissue in tissues]
+    except InvalidValueError as error:
+        raise InvalidValueError(f"{volume.name}: {error}") from error
+
+
 class Scanner:
     """Samples planes of volumes and clusters what they show.
 
@@ -97,7 +105,7 @@ class Scanner:
     def __init__(self, volumes: Sequence[LabelVolume], tissues: Tissues) -> None:
         self.volumes = tuple(volumes)
         self._shapes = [volume.slice_shape for volume in self.volumes]
-        rules = [[tissue.neighbourhood(volume.pixel_mm) for tissue in tissues] for volume in self.volumes]
+        rules = [_neighbourhoods(volume, tissues) for volume in self.volumes]
         longest = max(len(rule.half_widths) for each in rules for rule in each)
         half_widths = np.full((len(rules), len(tissues), longest), -1, dtype=np.int64)
         for volume, each in enumerate(rules):

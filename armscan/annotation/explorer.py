@@ -17,9 +17,8 @@ from armscan.envs.observations import View
 from armscan.envs.panels import BACKGROUND, INK, LINE_INK, OPTIMUM_INK, PLANE_INK, Ink
 from armscan.envs.rendering import HEIGHT, WIDTH, Box, ReferencePlane, RewardHistory, draw_plane, view_of
 from armscan.envs.rules import Volumes, named_volumes
-from armscan.envs.scene import SceneSampler
+from armscan.envs.scene import reachable_optimum
 from armscan.envs.window import check_display, picture_figure
-from armscan.errors import OptimalPlaneError
 from armscan.utils.validation import check_choice
 from armscan.volumes import LabelVolume, ManipulatorAction, open_dataset
 
@@ -195,15 +194,6 @@ def explore(
     )
     explorer.figure.show()
     return explorer
-
-
-def reachable_optimum(volume: LabelVolume) -> ManipulatorAction | None:
-    """Return a volume's optimal plane with its origin within the volume; None if that is not possible or not known."""
-    sampler = SceneSampler(rotation_bounds_deg=(BOUND_DEG, BOUND_DEG), translation_bounds_mm=None, transform=None)
-    try:
-        return sampler.unmoved(volume).optimum
-    except OptimalPlaneError:
-        return None
 
 
 def _named(volumes: LabelVolume | Volumes) -> dict[str, LabelVolume]:

@@ -5,22 +5,28 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from PIL import Image
 
 from armscan.anatomy import SUCCESS_THRESHOLD, FoundPlane, LandmarkReward, PlaneScorer, Tissues, find_optimal_plane
 from armscan.envs.rendering import ReferencePlane, draw_plane, view_of
-from armscan.errors import InvalidValueError, OptimalPlaneError, listed
+from armscan.errors import ArmscanError, InvalidValueError, OptimalPlaneError, listed
+from armscan.utils.console import print_sentence
 from armscan.utils.files import atomic_write
 from armscan.volumes import (
     Dataset,
     LabelVolume,
     ManipulatorAction,
     open_dataset,
+    plane_distance,
     read_markup,
     record_planes,
     write_markup,
 )
 from armscan.volumes.markups import MARKUP_SUFFIX
+
+# Distance in mm and degrees below which two planes are the same: what writing and reading a file rounds.
+SAME = 1e-3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +54,7 @@ class LabellingOptions:
     volume: str | None = None
 
 
-def label(options: LabellingOptions) -> tuple[list[tuple[LabelVolume, FoundPlane]], list[OptimalPlaneError]]:
+def label(options: LabellingOptions) -> tuple[list[tuple[LabelVolume, FoundPlane]], list[ArmscanError]]:
     """Find or read a plane for each volume, draw it and write it into the manifest, volume by volume.
 
     Returns:
@@ -60,7 +66,7 @@ def label(options: LabellingOptions) -> tuple[list[tuple[LabelVolume, FoundPlane
     if options.markups and options.markup is None:
         _write_known_markups(options, dataset.volumes, set(volumes))
     labelled: list[tuple[LabelVolume, FoundPlane]] = []
-    failures: list[OptimalPlaneError] = []
+    failures: list[ArmscanError] = []
     for number, (name, volume) in enumerate(volumes.items(), 1):
         print(f"{number}/{len(volumes)}  {name}", flush=True)
         try:
@@ -68,14 +74,15 @@ def label(options: LabellingOptions) -> tuple[list[tuple[LabelVolume, FoundPlane
                 plane = _drawn(options.markup, volume, options.tissues)
             else:
                 plane = find_optimal_plane(volume, success_threshold=SUCCESS_THRESHOLD, clustering=options.tissues)
-        except OptimalPlaneError as error:
+        # The latter: the clustering rules are none for its spacing.
+        except (OptimalPlaneError, InvalidValueError) as error:
             failures.append(error)
             continue
         # The manifest last: no plane is written into it without a picture.
         _make_folder(options.pictures)
         _write_picture(options.pictures / f"{name}.png", volume, plane.action, options.tissues)
         if options.markups:
-            write_markup(options.pictures / f"{name}{MARKUP_SUFFIX}", volume, plane.action)
+            _write_markup(options.pictures, volume, plane.action)
         record_planes(options.data, {name: (plane.action, plane.score)}, read_with=dataset.manifest)
         labelled.append((volume, plane))
     return labelled, failures
@@ -106,7 +113,21 @@ def _write_known_markups(options: LabellingOptions, volumes: dict[str, LabelVolu
         is_asked_for = options.volumes is None or name in options.volumes
         if is_asked_for and name not in to_label and volume.optimal_action is not None:
             _make_folder(options.pictures)
-            write_markup(options.pictures / f"{name}{MARKUP_SUFFIX}", volume, volume.optimal_action)
+            _write_markup(options.pictures, volume, volume.optimal_action)
+
+
+def _write_markup(folder: Path, volume: LabelVolume, action: ManipulatorAction) -> None:
+    """Write a plane as a markups file, unless a person has moved the plane in the file that is there."""
+    path = folder / f"{volume.name}{MARKUP_SUFFIX}"
+    if path.exists():
+        stored = read_markup(path, volume)
+        planes = [action] if volume.optimal_action is None else [action, volume.optimal_action]
+        if not any(np.allclose(plane_distance(stored, each, volume.slice_centre_mm), 0, atol=SAME) for each in planes):
+            print_sentence(
+                f"note: {path} holds another plane, and is left as it is: read it back with --markup, or delete it"
+            )
+            return
+    write_markup(path, volume, action)
 
 
 def _make_folder(folder: Path) -> None:

@@ -31,8 +31,8 @@ def data() -> None:
 
 
 @data.command(epilog=examples("data inspect wrists"))
-@click.argument("folder")
-def inspect(folder: str) -> None:
+@click.argument("folder", type=FILE_PATH)
+def inspect(folder: Path) -> None:
     """Print the contents of the volumes in FOLDER.
 
     Volumes are read through the manifest, if there is one; their tissues, and what is missing or ignored, are listed.
@@ -45,7 +45,7 @@ def inspect(folder: str) -> None:
 
 
 @data.command(epilog=examples("data label wrists", "data label wrists --volume a.nii.gz --markup moved.mrk.json"))
-@click.argument("folder")
+@click.argument("folder", type=FILE_PATH)
 @click.option("--volumes", type=CommaSeparated("NAME"), help="Only these volumes, by their file names.")
 @click.option("--overwrite", is_flag=True, help="Also label volumes that have a plane.")
 @click.option(
@@ -60,7 +60,7 @@ def inspect(folder: str) -> None:
 @click.option("--volume", metavar="NAME", help="Volume of --markup.")
 @clustering_option
 def label(
-    folder: str,
+    folder: Path,
     volumes: tuple[str, ...] | None,
     overwrite: bool,
     pictures: Path | None,
@@ -79,19 +79,19 @@ def label(
     if markup is not None and (volumes or overwrite):
         idle = "--volumes" if volumes else "--overwrite"
         raise click.UsageError(f"{idle} is for a search, but --markup and --volume say which plane and for what")
-    if pictures is None and Path(folder, PICTURES).is_symlink():
+    if pictures is None and (folder / PICTURES).is_symlink():
         # Otherwise the author of the data folder would choose where pictures are written.
-        raise InvalidValueError(f"{Path(folder, PICTURES)}: is a link: name the folder of the pictures with --pictures")
+        raise InvalidValueError(f"{folder / PICTURES}: is a link: name the folder of the pictures with --pictures")
     from armscan.anatomy import check_tissues
     from armscan.annotation.labelling import LabellingOptions
     from armscan.annotation.labelling import label as label_planes
 
     options = LabellingOptions(
-        data=Path(folder),
+        data=folder,
         tissues=check_tissues(clustering or "pixels"),
         volumes=volumes,
         overwrite=overwrite,
-        pictures=pictures or Path(folder, PICTURES),
+        pictures=pictures or folder / PICTURES,
         markups=markups,
         markup=markup,
         volume=volume,
@@ -100,7 +100,7 @@ def label(
     if labelled:
         _print_planes(options, labelled)
     elif not failures:
-        print("every volume has a plane already; --overwrite looks for new ones")
+        print(f"every volume{' named' if volumes else ''} has a plane already; --overwrite looks for new ones")
         if markups:
             print(f"their planes as files for 3D Slicer are in {options.pictures}")
     for failure in failures:
@@ -109,16 +109,20 @@ def label(
 
 
 @data.command(epilog=examples("data explore wrists --volume a.nii.gz"))
-@click.argument("folder", required=False)
+@click.argument("folder", type=FILE_PATH, required=False)
 @click.option("--volume", metavar="NAME", help="Volume to begin with.  [default: the first]")
 @clustering_option
-def explore(folder: str | None, volume: str | None, clustering: str | None) -> None:
+def explore(folder: Path | None, volume: str | None, clustering: str | None) -> None:
     """Move the plane with sliders in a window.
 
     FOLDER holds the volumes, with a manifest or without. Default: phantom wrists.
 
     In a notebook: %matplotlib widget, then armscan.annotation.explorer.explore(volume).
     """
+    from armscan.envs.window import check_display
+
+    # Before pyplot: it raises for a backend of MPLBACKEND that does not exist.
+    check_display()
     from matplotlib import pyplot
 
     from armscan.annotation.explorer import explore as open_explorer
@@ -127,16 +131,20 @@ def explore(folder: str | None, volume: str | None, clustering: str | None) -> N
     pyplot.show()
 
 
-def _print_dataset(dataset: Dataset, folder: str) -> None:
+def _print_dataset(dataset: Dataset, folder: Path) -> None:
     """Print a table for each volume, and the excluded volumes."""
     # Lines of a file or a pipe are never wrapped.
     console = wide_console(WHOLE_CHARS)
     for name, report in dataset.reports.items():
-        plane = "a labelled plane" if dataset.volumes[name].optimal_action else "no labelled plane"
+        plane = _plane_of(report.volume)
         split = f"for {dataset.splits[name]}, " if dataset.splits else ""
         console.print(Text(f"{name}: subject {dataset.subjects[name]}, {split}{plane}", style="bold"))
         console.print(Text(_geometry(report)))
         console.print(_tissue_table(report))
+        if not report.has_palm_at_high_z:
+            console.print(
+                Text("note: the palm is at low z, in phantoms at high z; orientation in the manifest flips it")
+            )
     for name, reason in dataset.excluded.items():
         console.print(Text(f"{name}: excluded" + ("" if reason == "True" else f" ({reason})")))
     n_volumes, n_subjects = len(dataset.reports), len(set(dataset.subjects.values()))
@@ -149,7 +157,15 @@ def _print_dataset(dataset: Dataset, folder: str) -> None:
     if n_labelled < n_volumes:
         from armscan.config.command_hints import armscan_command
 
-        console.print(Text(f"find the missing planes: {armscan_command('data', 'label', folder)}"))
+        console.print(Text(f"find the missing planes: {armscan_command('data', 'label', str(folder))}"))
+
+
+def _plane_of(volume: LabelVolume) -> str:
+    from armscan.envs.scene import reachable_optimum
+
+    if volume.optimal_action is None:
+        return "no labelled plane"
+    return "a labelled plane" if reachable_optimum(volume) else "a labelled plane that misses the volume"
 
 
 def _tissue_table(report: VolumeReport) -> Table:
@@ -202,7 +218,7 @@ def _print_planes(options: LabellingOptions, labelled: Sequence[tuple[LabelVolum
                 ", ".join(map(str, plane.counts)),
                 f"{rz:.1f}, {rx:.1f}",
                 f"{tx:.1f}, {ty:.1f}",
-                "-" if plane.spread is None else "{:.0f}, {:.0f}, {:.0f}".format(*plane.spread),
+                "-" if plane.spread is None else "≥ " * plane.is_cut + "{:.0f}, {:.0f}, {:.0f}".format(*plane.spread),
             ]
         )
     print_sentence(f"planes written into the manifest of {options.data}")

@@ -104,6 +104,8 @@ def side_panels(
 ) -> tuple[Image.Image, Image.Image]:
     """Draw the unmoved volume from the palm (frontal) and from the side (sagittal), fingers up, at one scale.
 
+    In a right-handed frame, X then runs to the left, and the side is the one at high x.
+
     Args:
         volume: Volume to draw.
         transform: Motion of the volume in the episode. None: no motion.
@@ -111,8 +113,10 @@ def side_panels(
             the last one is on top.
         rooms: Size (width, height) in pixels that each picture fits into; its aspect ratio is kept.
     """
+    is_right_handed = np.linalg.det(volume.direction) > 0
     if volume not in _SIDES:
-        from_palm, from_side = _first_seen(volume.labels[:, :, ::-1], 2), _first_seen(volume.labels, 0)
+        labels = volume.labels[::-1] if is_right_handed else volume.labels
+        from_palm, from_side = _first_seen(labels[:, :, ::-1], 2), _first_seen(labels, 0)
         _SIDES[volume] = TISSUE_INKS[from_palm.T], TISSUE_INKS[from_side]
     across_mm, along_mm, depth_mm = volume.size_mm
     sizes_mm = (across_mm, along_mm), (depth_mm, along_mm)
@@ -123,6 +127,8 @@ def side_panels(
     )
     for action, ink, line_width in planes:
         corners_mm = _corners_mm(volume, transform, action)
+        if is_right_handed:
+            corners_mm[:, 0] = across_mm - corners_mm[:, 0]
         for picture, axes in ((frontal, [0, 1]), (sagittal, [2, 1])):
             corners = corners_mm[:, axes] * picture.size / np.array(volume.size_mm)[axes]
             outline = [(x, y) for x, y in (*corners, corners[0])]

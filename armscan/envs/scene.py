@@ -205,6 +205,15 @@ class SceneSampler:
         return Scene(volume, transform, replace(within, rotation=(float(rotation[0]), float(rotation[1]))), bounds)
 
 
+def reachable_optimum(volume: LabelVolume) -> ManipulatorAction | None:
+    """Return a volume's labelled plane with its origin within the volume; None if that is not possible or not known."""
+    sampler = SceneSampler(rotation_bounds_deg=(180.0, 180.0), translation_bounds_mm=None, transform=None)
+    try:
+        return sampler.unmoved(volume).optimum
+    except OptimalPlaneError:
+        return None
+
+
 def shows_labelled(scene: Scene) -> bool:
     """Return whether the optimal plane of a scene shows exactly the slice of the labelled plane.
 

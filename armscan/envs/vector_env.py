@@ -75,8 +75,13 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
         self.single_action_space = self.rules.action_space
         self.observation_space = batch_space(self.rules.observation_space, self.num_envs)
         self.action_space = batch_space(self.rules.action_space, self.num_envs)
-        self._rngs = [seeding.np_random()[0] for _ in range(self.num_envs)]
+        self._rngs, self._rng_seeds = map(list, zip(*(seeding.np_random() for _ in range(self.num_envs)), strict=True))
         self._episodes: list[Episode | None] = [None] * self.num_envs
+
+    @property
+    def np_random_seed(self) -> Any:
+        """Seed of each environment's random generator, as Gymnasium's vector environments have it: a tuple."""
+        return tuple(self._rng_seeds)
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -98,7 +103,7 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
         names, seeds = self._volume_names(options), self._seeds(seed)
         for i, one_seed in enumerate(seeds):
             if one_seed is not None and i in chosen:
-                self._rngs[i] = seeding.np_random(one_seed)[0]
+                self._rngs[i], self._rng_seeds[i] = seeding.np_random(one_seed)
         self._begin(chosen, names)
         look(self.rules, self.episodes(chosen))
         episodes = self.episodes(range(self.num_envs))

@@ -38,6 +38,8 @@ NRRD_TYPES |= {"long long int": 8, "ulonglong": 8, "int64": 8, "uint64": 8, "flo
 OTHER_LENGTHS = {f"{prefix}{unit}" for prefix in ("", "centi", "micro", "nano") for unit in ("meter", "metre")}
 OTHER_LENGTHS |= {f"{name}s" for name in OTHER_LENGTHS} | {"m", "cm", "um", "\u00b5m", "\u03bcm", "nm"}
 OTHER_LENGTHS |= {"micron", "microns", "in", "inch", "inches"}
+# Spaces of NRRD that are not the patient's; SimpleITK reads them as left-posterior-superior.
+NO_ANATOMY = ("scanner-xyz", "sxyz", "3d-right-handed", "3dr", "3d-left-handed", "3dl")
 NRRD_ENCODINGS = {"raw": None, "gzip": GZIP, "gz": GZIP}
 
 
@@ -48,6 +50,11 @@ def check_nrrd(path: Path, needed: Sequence[str] = ()) -> None:
         header, end, _ = _text_header(path).partition(b"\r\n\r\n")
     fields = {name.lower(): value for name, value in _fields(path, header, ":(?!=)").items()}
     _check_nrrd_spacing(path, fields)
+    if (space := fields.get("space", "").lower()) in NO_ANATOMY:
+        raise VolumeError(
+            f"{path}: space is {space}, which does not say where left, posterior and superior are; it must be "
+            "left-posterior-superior or another anatomical space, or not there"
+        )
     for name in ("space units", "units"):
         _check_units(path, name, re.findall(r'"([^"]*)"', fields.get(name, "")))
     _check_finite(path, "space origin", fields, re.findall(r"[^\s(),]+", fields.get("space origin", "")))

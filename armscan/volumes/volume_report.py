@@ -6,7 +6,17 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 
-from armscan.volumes.labelmap import BACKGROUND, LABEL_NAMES, FoundSource, LabelMap, Source, count_values
+import numpy as np
+
+from armscan.volumes.labelmap import (
+    BACKGROUND,
+    LABEL_NAMES,
+    TISSUE_LABELS,
+    FoundSource,
+    LabelMap,
+    Source,
+    count_values,
+)
 from armscan.volumes.orientation import Crop, orientation_of
 from armscan.volumes.volume import LabelVolume
 
@@ -49,6 +59,16 @@ class VolumeReport:
         """Number of voxels of each tissue."""
         counts = count_values(self.volume.labels)
         return {tissue: counts.get(label, 0) for label, tissue in LABEL_NAMES.items() if label != BACKGROUND}
+
+    @property
+    def has_palm_at_high_z(self) -> bool:
+        """Whether the tendons lie at higher z than the bones on average, as in phantoms; True without one of them."""
+        depths = range(self.volume.shape[2])
+        each = [(self.volume.labels == TISSUE_LABELS[tissue]).sum(axis=(0, 1)) for tissue in ("bones", "tendons")]
+        if not all(n_voxels.any() for n_voxels in each):
+            return True
+        bones, tendons = (np.average(depths, weights=n_voxels) for n_voxels in each)
+        return bool(tendons > bones)
 
     @property
     def tissue_mm3(self) -> dict[str, float]:

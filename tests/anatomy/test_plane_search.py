@@ -26,6 +26,8 @@ def test_find_optimal_plane_lands_near_the_plane_of_a_phantom(seed):
     assert angle_deg < 6.0
     assert found.score == 0.0
     assert found.counts == (4, 3, 1)
+    # As good planes lie at the limit of 10 degrees about X.
+    assert found.is_cut
 
 
 def test_find_optimal_plane_scores_what_its_plane_shows_within_the_bounds(phantom):

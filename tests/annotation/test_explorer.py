@@ -116,7 +116,7 @@ def test_explore_shows_the_last_rewards_in_its_picture(explorer, monkeypatch):
     monkeypatch.setattr(armscan.annotation.explorer, "N_REMEMBERED", 3)
     drawn = []
     monkeypatch.setattr(
-        armscan.annotation.explorer, "History", lambda rewards, places, *_: drawn.append((rewards, places))
+        armscan.annotation.explorer, "RewardHistory", lambda rewards, places, *_: drawn.append((rewards, places))
     )
     for along_mm in (20.0, 60.0, 100.0, 140.0):
         explorer.sliders["ty"].set_val(along_mm)

@@ -105,10 +105,34 @@ def test_label_goes_on_after_a_volume_without_an_optimal_plane(bare, names, quic
     assert "planes written into the manifest" in captured.out
 
 
+def test_label_goes_on_after_a_volume_that_the_clustering_rules_do_not_fit(bare, names, quick, write_labelmap, capsys):
+    write_labelmap("bare/0_coarse.nii.gz", spacing=(0.3, 0.4, 1.1))
+    assert main(["data", "label", str(bare), "--clustering=metric"]) == 2
+    assert all(planes(bare)[name] is not None for name in names)
+    assert "error: 0_coarse.nii.gz: eps_mm of label 3 is 0.6" in capsys.readouterr().err
+
+
+def test_label_keeps_a_markups_file_with_a_plane_that_a_person_has_moved(bare, names, dataset, quick, capsys):
+    assert main(["data", "label", str(bare), "--markups"]) == 0
+    file, moved = bare / "labelling" / f"{names[0]}.mrk.json", ManipulatorAction((5.0, -2.0), (0.0, 20.0))
+    write_markup(file, dataset[names[0]], moved)
+    capsys.readouterr()
+    for more in ([], ["--overwrite"]):
+        assert main(["data", "label", str(bare), "--markups", *more]) == 0
+        np.testing.assert_allclose(read_markup(file, dataset[names[0]]).to_array(), moved.to_array(), atol=1e-6)
+        said = " ".join(capsys.readouterr().out.split())
+        assert said.count("holds another plane, and is left as it is") == 1
+    # Once it is read back, it is the manifest's plane.
+    assert main(["data", "label", str(bare), f"--volume={names[0]}", f"--markup={file}"]) == 0
+    assert main(["data", "label", str(bare), "--markups"]) == 0
+    assert "holds another plane" not in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         ([], "Missing argument 'FOLDER'."),
+        ([""], "Invalid value for 'FOLDER'"),
         (["x", "y"], "Got unexpected extra argument (y)"),
         (["x", "--planes=3"], "No such option '--planes'"),
         (["x", "--volumes="], "Invalid value for '--volumes': '' has an empty part."),

@@ -1,5 +1,7 @@
 """The command that shows what is in a folder of volumes."""
 
+import shutil
+
 from armscan.cli.main import main
 
 
@@ -31,6 +33,20 @@ def test_data_command_tells_what_each_volume_holds(write_labelmap, tmp_path, mon
         "2 volumes of 2 subjects, 1 with a labelled plane",
     ):
         assert part in printed
+
+
+def test_data_command_notes_a_palm_at_low_z_and_a_plane_that_misses_the_volume(data_folder, tmp_path, capsys):
+    volume = next(data_folder.glob("*.nii.gz"))
+    shutil.copyfile(volume, tmp_path / volume.name)
+    manifest = tmp_path / "manifest.yaml"
+    manifest.write_text(f"orientation: LPI\nvolumes: {{{volume.name}: {{rotation: [0, 0], translation: [0, 5000]}}}}\n")
+    assert main(["data", "inspect", str(tmp_path)]) == 0
+    printed = capsys.readouterr().out
+    assert "a labelled plane that misses the volume" in printed
+    assert "note: the palm is at low z" in printed
+    manifest.write_text("orientation: LPS\n")
+    assert main(["data", "inspect", str(tmp_path)]) == 0
+    assert "note:" not in capsys.readouterr().out
 
 
 def test_data_command_needs_no_manifest(write_labelmap, tmp_path, capsys):

@@ -13,6 +13,7 @@ from armscan.envs.panels import (
     SHADES,
     TISSUE_INKS,
     UNCLUSTERED,
+    side_panels,
     slice_panel,
 )
 from armscan.envs.rendering import (
@@ -105,6 +106,29 @@ def test_render_outlines_clusters_alone():
     has_outline = (voxels == OUTLINE_INK).all(axis=-1).any(axis=(1, 3)).T
     assert has_outline.sum() > 80
     assert not has_outline[~is_clustered].any()
+
+
+@pytest.mark.parametrize("is_right_handed", [True, False])
+def test_render_shows_a_volume_as_it_is_seen_from_the_palm_and_from_the_side(is_right_handed):
+    labels = np.zeros((30, 40, 20), dtype=np.uint8)
+    labels[2:6, 4:36, 2:8], labels[24:28, 4:36, 2:8] = 1, 2
+    # Nearest to the palm, with the second tissue.
+    labels[24:28, 10:20, 15:18] = 3
+    direction = np.diag([1.0 if is_right_handed else -1.0, 1.0, 1.0])
+    volume = LabelVolume(labels, (1.0, 1.0, 1.0), "blocks", direction=direction)
+    plane = ManipulatorAction((20.0, 0.0), (0.0, 10.0))
+    frontal, sagittal = map(np.asarray, side_panels(volume, None, [(plane, PLANE_INK, 1)], ((300, 400), (200, 400))))
+    # Seen from high z with the fingers, at low y, up: X runs to the left in a right-handed frame.
+    at_left, at_right = (frontal[300, column] for column in (40, 260))
+    assert [*map(tuple, (at_left, at_right))] == [
+        tuple(TISSUE_INKS[label]) for label in ((2, 1) if is_right_handed else (1, 2))
+    ]
+    artery = 40 if is_right_handed else 260
+    assert tuple(frontal[150, artery]) == tuple(TISSUE_INKS[3])
+    rows, columns = np.nonzero((frontal == PLANE_INK).all(axis=-1))
+    assert (np.corrcoef(rows, columns)[0, 1] < 0) == is_right_handed
+    # From the side, z runs to the right: the nearer tissue is at high x, or at low x in a left-handed frame.
+    assert tuple(sagittal[300, 50]) == tuple(TISSUE_INKS[2 if is_right_handed else 1])
 
 
 def test_draw_plane_without_an_episode_names_no_step_and_no_optimal_plane(phantom, monkeypatch):

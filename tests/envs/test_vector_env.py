@@ -63,6 +63,7 @@ def test_vector_env_gives_bit_for_bit_what_single_environments_give(volumes, var
     assert ours.observation_space == theirs.observation_space
     assert ours.action_space == theirs.action_space
     assert_same(ours.reset(seed=7), theirs.reset(seed=7))
+    assert ours.unwrapped.np_random_seed == theirs.np_random_seed == (7, 8, 9)
     ours.action_space.seed(0)
     n_ended = 0
     for _ in range(14):

@@ -153,6 +153,11 @@ def test_nifti_headers_that_would_be_mended_or_printed_about_are_refused(refusal
             "space units is 'um', but only volumes in mm",
         ),
         ("a.nrrd", nrrd(10, VOXELS).replace(b"(0,0,0)", b"(0,nan,0)"), "space origin is '(0,nan,0)', but it must be"),
+        (
+            "a.nrrd",
+            nrrd(10, VOXELS).replace(b"left-posterior-superior", b"3D-left-handed"),
+            "space is 3d-left-handed, which does not say where left, posterior and superior are",
+        ),
         ("a.mha", mha(10, VOXELS).replace(b"NDims", b"DistanceUnits = um\nNDims"), "DistanceUnits is 'um', but only"),
         ("a.mha", mha(10, VOXELS).replace(b"NDims", b"Offset = nan 2 3\nNDims"), "Offset is 'nan 2 3', but it must be"),
         ("a.nrrd", nrrd(10, VOXELS + b"1"), "the file is damaged: it holds more than 1000 bytes"),
