@@ -15,6 +15,8 @@ from armscan.envs.rules import Observed
 
 # A batch of observations as tensors: one of shape (n, k), or the parts by their names, each of shape (n, ...).
 ObservationTensors = torch.Tensor | dict[str, torch.Tensor]
+# Reason of `Policy.differs`.
+SAMPLING = "the agent samples its actions, and this is the deterministic one"
 
 
 class Policy(nn.Module):
@@ -40,7 +42,7 @@ class Policy(nn.Module):
         super().__init__()
         self.actor = plain_copy(actor).eval().requires_grad_(requires_grad=False)
         self._bounded = bounded
-        self.differs = "the agent samples its actions, and this is the deterministic one" if is_sampling else None
+        self.differs = SAMPLING if is_sampling else None
         """Reason why the learner's own `act` may give other numbers; None if it gives the same."""
         if self.differs is None and not compute.is_float32_on_cpu:
             self.differs = f"the agent has computed with {compute.precision} on {compute.torch_device}"

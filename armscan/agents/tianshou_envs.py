@@ -45,10 +45,9 @@ class TianshouVectorEnv(BaseVectorEnv):
         self._action_spaces = [deepcopy(envs.single_action_space) for _ in range(envs.num_envs)]
 
     def get_env_attr(self, key: str, id: Ids = None) -> list[Any]:  # noqa: A002 - Tianshou's name
-        """Return an attribute of each environment, such as its action space."""
-        if key == "action_space":
-            return list(self._action_spaces)
-        return [getattr(self._envs, f"single_{key}", getattr(self._envs, key, None))] * self.env_num
+        """Return the action space of each environment, the only attribute that Tianshou asks for."""
+        assert key == "action_space"
+        return list(self._action_spaces)
 
     def reset(self, env_id: Ids = None, **kwargs: Any) -> tuple[Any, NDArray[Any]]:
         """Start episodes; return the first observations of these environments, and infos with only their IDs."""

@@ -25,9 +25,10 @@ PGPASSWORD = "PGPASSWORD"
 FILE_SUFFIX = "_FILE"
 # USER:PASSWORD@, where the password of a database may contain a slash; or an option such as sslpassword=.
 PASSWORD = re.compile(
-    r"""https?://[^/?#]*:[^/?#]*@
+    r"""(?<![\w+.-])(?:
+    https?://[^/?#]*:[^/?#]*@
     | (?!https?:|sqlite|file)[\w+.-]+://[^/?#:]*:[^?#]*@
-    | (?!sqlite|file)[\w+.-]+://.*[?&]\w*password=.""",
+    | (?!sqlite|file)[\w+.-]+://.*[?&]\w*password=.)""",
     re.VERBOSE,
 )
 ACCOUNT = re.compile(r"(?<=://)([^/@:?#\s]*):([^/@?#\s]*)@")
@@ -37,10 +38,15 @@ MIN_MASKED_CHARS = 4
 
 
 def check_address(name: str, uri: str) -> None:
-    """Raise `InvalidValueError` if an address contains a password; `name` says where the address comes from."""
-    if PASSWORD.match(uri) is None:
+    """Raise `InvalidValueError` if an address, or one of several in a text, contains a password.
+
+    Args:
+        name: Origin of the address, such as `tracking.uri`.
+        uri: Address or text.
+    """
+    if (found := PASSWORD.search(uri)) is None:
         return
-    if uri.startswith("http"):
+    if found[0].startswith("http"):
         instead = f"set MLFLOW_TRACKING_USERNAME and {SERVER_PASSWORD}"
     else:
         variable = STORAGE_PASSWORD if "storage" in name.partition(" ")[0].lower() else TRACKING_PASSWORD
@@ -52,7 +58,8 @@ def check_words(words: Sequence[str]) -> None:
     """Raise `InvalidValueError` if a `key=value` word of a command line contains a password."""
     for word in words:
         key, _, value = word.partition("=")
-        check_address(key, value.strip("'\""))
+        # Hydra removes the backslash of an escaped colon, and reads several values.
+        check_address(key, value.replace("\\", ""))
 
 
 def read_password(variable: str) -> str | None:

@@ -12,11 +12,11 @@ import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 from armscan.config.legacy import migrate
 from armscan.config.sources import SWEEP, config_folder, own_folders, sweeps_folder, yaml_files
-from armscan.errors import UntrustedError
-from armscan.utils.files import SQLITE_PREFIX
+from armscan.errors import UntrustedError, listed
 
 TRUST = "--trust"
 HOW = f"if you trust its author, repeat the command with {TRUST}"
@@ -25,6 +25,8 @@ TARGETS = re.compile(rf"""{TARGET}["']?: *["']?([\w.]+)""")
 SERVER = re.compile(r"(?<![\w+.-])(?!sqlite:)[\w+.-]+://")
 # A path that leads out of a group of the configuration: Hydra composes any YAML file that the choice of a group names.
 OUTSIDE = re.compile(r"\.\.|(?<![\w-])/")
+# Schemes of artifacts whose clients send no password of MLflow's: a path, a folder, object stores.
+WITHOUT_PASSWORD = ("", "file", "s3", "gs", "wasbs", "abfss")
 # Of grids and studies; the configuration of a run names none of their classes.
 GROUPS_OF_COMMANDS = ("hydra", "study")
 PACKAGES_OF_COMMANDS = ("armscan.launch.", "armscan.sweeps.")
@@ -134,20 +136,40 @@ def check_stored_words(words: Sequence[str], uri: str, *, where: str) -> None:
 
 
 def check_stored_address(uri: str, own: Collection[str]) -> None:
-    """Raise `UntrustedError` if a stored address is that of a server which is not known as this user's.
+    """Raise `UntrustedError` if a stored address is that of a store which is not known as this user's.
 
     Clients find passwords in many places, such as the environment, its files, `~/.pgpass` and `~/.mlflow/credentials`,
-    and send them to the server that they are told to use.
+    and send them to the server that they are told to use. A database says in which folders artifacts are written.
 
     Args:
         uri: Address of a tracking store, as a folder or a store names it.
         own: Addresses of this user's stores.
     """
-    if not uri.startswith(SQLITE_PREFIX) and uri.rstrip("/") not in (each.rstrip("/") for each in own):
+    if uri.rstrip("/") not in (each.rstrip("/") for each in own):
         raise UntrustedError(
-            f"{uri} is not a store that this user has used here, and it could be sent this user's passwords: give "
-            f"--tracking {uri} if it is yours"
+            f"{uri} is not a store that this user has used here: it could be sent this user's passwords, or have files "
+            f"written anywhere; give --tracking {uri} if it is yours"
         )
+
+
+def check_artifact_address(uri: str, store: str) -> None:
+    """Raise `UntrustedError` if artifacts are on a server that could be sent this user's password for another.
+
+    MLflow sends the password of its tracking server to each address over HTTP that a run or an experiment names.
+
+    Args:
+        uri: Address of the artifacts of a run, or of an experiment.
+        store: Address of the tracking store that names it.
+    """
+    at, here = urlsplit(uri), urlsplit(store)
+    # Without a server of its own, `mlflow-artifacts:/...` is on the store's.
+    is_here = (at.netloc or here.netloc) == here.netloc and at.scheme in ("mlflow-artifacts", here.scheme)
+    if at.scheme in WITHOUT_PASSWORD or (here.scheme in ("http", "https") and is_here):
+        return
+    raise UntrustedError(
+        f"the artifacts are in {uri}, but in a store at {store} they must be {listed(WITHOUT_PASSWORD[1:])}, or on its "
+        "own server: another would be sent this user's password"
+    )
 
 
 def _leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:

@@ -20,6 +20,7 @@ from armscan.training import CheckpointProvenance, Fingerprints, TrainingDomain,
 
 # Keys of the section `data` that hold paths.
 PATHS = ("path", "cache_dir")
+MAX_ENV_STEPS = 10**15
 
 
 @dataclass(frozen=True)
@@ -60,11 +61,24 @@ def agent_of_run(tracking: str, run_id: str, changes: Mapping[str, Any], *, trus
     run = load_agent_run(tracking, run_id)
     with tempfile.TemporaryDirectory() as folder:
         config = from_its_folder(changed(OmegaConf.create(run.config(Path(folder), trust=trust)), changes), run.tags)
+        if "cache_dir" in config.data and not trust:
+            # Anybody could name any folder; the user's own cache holds the same volumes.
+            config.data.cache_dir = None
         weights, facts = _weights(run, Path(folder))
         # Older runs of learners have them in the checkpoint only.
         volumes = run.volumes(Path(folder)) or facts.get("volumes") or None
     domain = TrainingDomain.from_json(run.tags[DOMAIN_TAG]) if DOMAIN_TAG in run.tags else None
-    return EvaluatedAgent(run.name, config, run, weights, int(facts.get("n_env_steps", 0)), domain, volumes)
+    return EvaluatedAgent(run.name, config, run, weights, _n_env_steps(facts, run.run_id), domain, volumes)
+
+
+def _n_env_steps(facts: Mapping[str, Any], run_id: str) -> int:
+    n_env_steps = facts.get("n_env_steps", 0)
+    if type(n_env_steps) is not int or not 0 <= n_env_steps <= MAX_ENV_STEPS:
+        raise CheckpointError(
+            f"run {run_id}: its checkpoint has n_env_steps = {n_env_steps!r}, but it must be a whole number from 0 to "
+            f"{MAX_ENV_STEPS}"
+        )
+    return n_env_steps
 
 
 def agent_of_overrides(words: Sequence[str], folder: str | None, changes: Mapping[str, Any]) -> EvaluatedAgent:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-from hydra.utils import instantiate
+from hydra.utils import get_method, instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from armscan.agents import (
@@ -191,6 +192,7 @@ def check_config(config: DictConfig) -> None:
     """
     check_sections(config)
     to_plain(config)
+    _check_data(config.data)
     check_seed("seed", config.seed)
     check_int("evaluation.episodes", config.evaluation.episodes, at_least=1)
     on_plane_of(config)
@@ -198,6 +200,22 @@ def check_config(config: DictConfig) -> None:
     build_section(config, "compute", Compute)
     instantiate(config.env, _convert_="object")
     scheduled_algorithms(make_algorithm(config), budget.segments)
+
+
+def _check_data(data: DictConfig) -> None:
+    """Raise `InvalidValueError` for a key that this choice of `data` does not take, as presets for another may set."""
+    target = str(data.get("_target_"))
+    # The function of a user may take any.
+    if not target.startswith("armscan."):
+        return
+    takes = inspect.signature(get_method(target)).parameters
+    if any(each.kind is each.VAR_KEYWORD for each in takes.values()):
+        return
+    if unknown := [key for key in map(str, data) if not key.startswith("_") and key not in takes]:
+        raise InvalidValueError(
+            f"data.{unknown[0]} is set, but this data has no such key, only {listed(takes)}: perhaps the experiment is "
+            "for another choice of data"
+        )
 
 
 def on_plane_of(config: DictConfig) -> tuple[OnPlane, ...]:

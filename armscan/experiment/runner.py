@@ -97,6 +97,8 @@ def run_tracked(
         print_sentence(f"{before}{text}")
 
     tell(f"run {tracked.run_id}: {tracked.name}")
+    if names := setup.split.names:
+        tell(names)
     trust = setup.needs_trust
     again = resume_command(tracked.run_id, tracking_uri, trust=trust)
     hint = _resume_hint_on_error(again, folder, is_told=job_label is None)

@@ -96,7 +96,7 @@ def make_model(agent: Learner, env: Env, folder: Path, facts: Mapping[str, Any])
         folder.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as beside:
             made = Path(beside, folder.name)
-            write_model(made, policy, batch, {**facts, "differs_from_agent": policy.differs})
+            write_model(made, policy, batch, {"differs_from_agent": policy.differs, **facts})
             _check(made, policy, played)
             if folder.exists():
                 folder.replace(Path(beside, "before"))

@@ -19,6 +19,8 @@ SECTIONS = re.compile(r"[\w.]+\.(?=\w+=)")
 LONG_NUMBER = re.compile(r"(?<==)\d+\.\d{5,}(e[-+]?\d+)?")
 # Keys that change the task of an episode, or how it is judged.
 RULES = ("projection", "reward", "env.")
+# What an agent sees of an episode: the task stays the same.
+SEEN = ("env.observation", "env.stack", "env.stack_exclude", "env.stack_memory", "env.memory", "env.flat")
 
 
 @dataclass(frozen=True)
@@ -105,9 +107,14 @@ def of_common_folds(trainings: Iterable[TrackedTraining]) -> list[TrackedTrainin
 
 
 def differing_rules(groups: Sequence[Group]) -> list[str]:
-    """Return the keys, apart from the agent's, in which the groups' episodes differ."""
+    """Return the keys, apart from the agent's and its observations', in which the groups' episodes differ."""
     params = [_compared(group.trainings[0].params) for group in groups]
-    return _differing([{key: value for key, value in each.items() if key.startswith(RULES)} for each in params])
+    return _differing(
+        [
+            {key: value for key, value in each.items() if key.startswith(RULES) and not _is_under(key, SEEN)}
+            for each in params
+        ]
+    )
 
 
 def _one_for_each_seed(trainings: Iterable[TrackedTraining]) -> list[TrackedTraining]:
@@ -139,8 +146,6 @@ def _differing(of_groups: Sequence[Mapping[str, str]]) -> list[str]:
 
 def _names(firsts: Sequence[TrackedTraining]) -> list[str]:
     """Return the names of groups, by the first training of each."""
-    if len(firsts) == 1:
-        return [SEED_IN_NAME.sub("", firsts[0].name)]
     params = [_compared(training.params) for training in firsts]
     keys = _differing(params)
     chosen = [each for each in firsts[0].choices if len({training.choices.get(each) for training in firsts}) > 1]

@@ -10,7 +10,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 from mlflow.entities import Run
-from mlflow.store.artifact.artifact_repository_registry import get_artifact_repository
 
 from armscan.config.defaults import FOLD, FOLDS
 from armscan.config.legacy import migrate
@@ -209,8 +208,7 @@ def _series(histories: Mapping[str, History]) -> dict[str, Series]:
 def _files(store: TrackingStore, run: Run, folder: Path) -> dict[str, bytes]:
     """Return the contents of those files that a comparison needs and the run has kept."""
     folder.mkdir(parents=True)
-    # `MlflowClient.download_artifacts` reads the run again for each file.
-    repository: Any = get_artifact_repository(run.info.artifact_uri, tracking_uri=store.mlflow.tracking_uri)
+    repository: Any = store.artifacts(run)
     names = {artifact.path for artifact in repository.list_artifacts()}
     return {
         name: Path(repository.download_artifacts(name, str(folder))).read_bytes()

@@ -12,6 +12,7 @@ from mlflow.exceptions import MlflowException
 from mlflow.models import Model
 
 from armscan.agents import Learner
+from armscan.agents.policy import SAMPLING
 from armscan.config.defaults import to_plain
 from armscan.errors import ExportError, InvalidValueError
 from armscan.evaluation import agent_of_run, own_split, prepare_on_volumes
@@ -50,7 +51,8 @@ def export_policy(tracking: str, run_id: str, folder: Path, *, trust: bool = Fal
     source = agent_of_run(tracking, run_id, {}, trust=trust)
     assert source.run is not None
     source.config.compute.update(PLAIN_COMPUTE)
-    if "deterministic_eval" in source.config.agent:
+    is_sampling = not source.config.agent.get("deterministic_eval", True)
+    if is_sampling:
         source.config.agent.deterministic_eval = True
     own = cache(partial(own_split, source, ("training", "test")))
     evaluator = prepare_on_volumes(source, {TEST: own().test}, own)
@@ -58,7 +60,11 @@ def export_policy(tracking: str, run_id: str, folder: Path, *, trust: bool = Fal
         raise InvalidValueError(f"run is {run_id!r}, but its agent does not learn and has no policy")
     env = evaluator.envs[TEST]
     slice_px = (source.domain or TrainingDomain.of(env)).slice_px
-    make_model(evaluator.agent, env, folder, facts_of(to_plain(source.config), env, source.run.run_id, slice_px))
+    facts = facts_of(to_plain(source.config), env, source.run.run_id, slice_px)
+    if is_sampling:
+        # The model is compared with deterministic actions, but the run's figures are of sampled ones.
+        facts["differs_from_agent"] = SAMPLING
+    make_model(evaluator.agent, env, folder, facts)
     return source.run
 
 

@@ -11,9 +11,9 @@ from functools import cached_property
 
 from mlflow.entities import Run
 from mlflow.exceptions import MlflowException
-from mlflow.store.artifact.artifact_repository_registry import get_artifact_repository
 from requests import RequestException
 
+from armscan.errors import UntrustedError
 from armscan.runs.run_folder import OwnFolder, RunSkippedError
 from armscan.stats.on_plane import OnPlane, leading_of
 from armscan.tracking import TrackingStore
@@ -43,10 +43,10 @@ def artifacts_of(client: TrackingStore, run: Run) -> dict[str, int] | None:
                 yield each.path, each.file_size or 0
 
     try:
-        repository = get_artifact_repository(run.info.artifact_uri, tracking_uri=client.mlflow.tracking_uri)
+        repository = client.artifacts(run)
         return dict(listed(None))
     # The run is listed all the same, with an unknown size.
-    except (MlflowException, RequestException, OSError):
+    except (MlflowException, RequestException, OSError, UntrustedError):
         return None
 
 

@@ -38,7 +38,7 @@ def show(client: TrackingStore, run: Run, uri: str) -> None:
     artifacts = artifacts_of(client, run)
     folder = _print_folder(console, run)
     if artifacts is None:
-        _print_pairs(console, f"artifacts in {run.info.artifact_uri}: their store does not answer", {})
+        _print_pairs(console, f"artifacts in {run.info.artifact_uri}: they cannot be read", {})
     else:
         _print_sizes(console, f"artifacts in {run.info.artifact_uri}", artifacts)
     children = client.children(run.info.experiment_id, run.info.run_id)

@@ -9,6 +9,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from armscan.config.credentials import mask_passwords
+from armscan.config.trust import check_artifact_address
 from armscan.errors import MAX_REASON_CHARS, TrackingUnavailableError, in_one_line
 from armscan.tracking.sanitize import tags_of
 from armscan.tracking.tags import PARENT_TAG
@@ -17,6 +18,7 @@ from armscan.utils.retry import RetryPolicy
 if TYPE_CHECKING:
     from mlflow import MlflowClient
     from mlflow.entities import Run
+    from mlflow.store.artifact.artifact_repo import ArtifactRepository
     from mlflow.store.entities import PagedList
 
 T = TypeVar("T")
@@ -31,6 +33,8 @@ PER_PAGE = 100
 SHORT = re.compile(
     r"\[Errno -?\d+\] ([\w -]+)|(Connection reset by peer|Connection aborted|[Rr]ead timed out)|(too many 50\d)"
 )
+# Methods of `MlflowClient` that open the address of a run's artifacts; the run's ID is their first argument.
+OF_ARTIFACTS = ("list_artifacts", "download_artifacts", "log_artifact", "log_artifacts")
 # Tag of each run, by which a run is found again if the reply to its creation was lost.
 MADE_TAG = "made"
 
@@ -69,7 +73,27 @@ class TrackingStore:
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(name)
-        return partial(self._asked, getattr(self.mlflow, name))
+        method = partial(self._asked, getattr(self.mlflow, name))
+        return partial(self._with_artifacts, method) if name in OF_ARTIFACTS else method
+
+    def _with_artifacts(self, method: Callable[..., T], run_id: str, *args: Any) -> T:
+        self.check_artifacts_of(self.get_run(run_id))
+        return method(run_id, *args)
+
+    def check_artifacts_of(self, run: Run) -> None:
+        """Raise `UntrustedError` if the artifacts of a run are on a server that is not the store's."""
+        check_artifact_address(run.info.artifact_uri, self.uri)
+
+    def artifacts(self, run: Run) -> ArtifactRepository:
+        """Return the artifacts of a run, without reading the run again for each file, as `MlflowClient` does.
+
+        Raises:
+            UntrustedError: If they are on a server that is not the store's.
+        """
+        from mlflow.store.artifact.artifact_repository_registry import get_artifact_repository
+
+        self.check_artifacts_of(run)
+        return get_artifact_repository(run.info.artifact_uri, tracking_uri=self.mlflow.tracking_uri)
 
     def create_run(self, experiment_id: str, *, name: str, tags: Mapping[str, str]) -> Run:
         """Create exactly one run, even if the store becomes unavailable before it replies."""

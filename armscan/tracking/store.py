@@ -17,6 +17,7 @@ from urllib.request import url2pathname
 from filelock import FileLock
 
 from armscan.config.credentials import SERVER_PASSWORD, TRACKING_PASSWORD, check_address, database_url, read_password
+from armscan.config.trust import check_artifact_address
 from armscan.errors import TrackingError
 from armscan.tracking.client import TrackingStore, reason_in
 from armscan.tracking.view import VIEW, VIEW_TAG
@@ -225,7 +226,7 @@ def _experiment_in(store: TrackingStore, name: str, artifacts: str | None) -> st
             return experiment_id
     if found.lifecycle_stage != "active":
         raise TrackingError(f"tracking.experiment is {name!r}, but it was deleted; restore it, or name another")
-    _check_writable(found.artifact_location)
+    _check_artifacts_in(found.artifact_location, store.uri)
     _keep_view(store, str(found.experiment_id), found.tags)
     return str(found.experiment_id)
 
@@ -237,8 +238,13 @@ def _keep_view(store: TrackingStore, experiment_id: str, tags: Mapping[str, str]
 
 
 def check_artifacts(store: TrackingStore, experiment_id: str) -> None:
-    """Raise `TrackingError` if the artifacts of an experiment cannot be written."""
-    _check_writable(store.get_experiment(experiment_id).artifact_location)
+    """Raise `TrackingError` if the artifacts of an experiment cannot be written, or are on another server."""
+    _check_artifacts_in(store.get_experiment(experiment_id).artifact_location, store.uri)
+
+
+def _check_artifacts_in(location: str, uri: str) -> None:
+    check_artifact_address(location, uri)
+    _check_writable(location)
 
 
 def _check_writable(location: str | None) -> None:

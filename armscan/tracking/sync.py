@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from armscan.config.trust import TRUST
 from armscan.errors import FolderInUseError, TrackingError, UntrustedError
@@ -20,6 +21,9 @@ from armscan.tracking.tags import FAILURE_TAG, FOLDER_TAG
 from armscan.tracking.uploader import upload
 from armscan.utils.log import log
 from armscan.utils.processes import ProcessInfo
+
+if TYPE_CHECKING:
+    from mlflow.entities import Run
 
 # Statuses of a run that has ended, as its outbox holds them.
 ENDED = ("FINISHED", "FAILED", "KILLED")
@@ -130,8 +134,10 @@ def _opened(opened: Callable[[str], TrackingStore], uri: str) -> TrackingStore |
 def _upload_of(outbox: Outbox, store: TrackingStore, *, trust: bool) -> Upload:
     n_entries, left = 0, None
     try:
+        run = store.get_run(outbox.address.run_id)
+        store.check_artifacts_of(run)
         if not trust:
-            _check_own(outbox, store)
+            _check_own(outbox, run)
     # Any error of the store, or an untrusted folder.
     except Exception as error:
         return Upload(outbox.folder, outbox.address.run_id, 0, reason_in(error))
@@ -144,13 +150,13 @@ def _upload_of(outbox: Outbox, store: TrackingStore, *, trust: bool) -> Upload:
     return Upload(outbox.folder, outbox.address.run_id, n_entries, left)
 
 
-def _check_own(outbox: Outbox, store: TrackingStore) -> None:
+def _check_own(outbox: Outbox, run: Run) -> None:
     """Raise `UntrustedError` unless the run was tracked from this folder: a stranger's could name any of the user's."""
-    run_id, folder = outbox.address.run_id, outbox.folder.resolve()
-    note = Note.of(run_id)
+    folder = outbox.folder.resolve()
+    note = Note.of(run.info.run_id)
     if note is not None and note.outbox.resolve() == outbox.file.resolve():
         return
-    noted = store.mlflow.get_run(run_id).data.tags.get(FOLDER_TAG)
+    noted = run.data.tags.get(FOLDER_TAG)
     if noted != str(folder):
         raise UntrustedError(
             f"the run was not tracked from here on this machine, and its own folder is {noted or 'not known'}; if you "

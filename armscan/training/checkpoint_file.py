@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import io
 import re
+import zipfile
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
@@ -56,7 +57,9 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
 
     try:
         with path.open("rb") as file:
-            loaded = torch.load(_verified(file, path), map_location="cpu", weights_only=True)
+            contents = _verified(file, path)
+            _check_uncompressed(contents, path)
+            loaded = torch.load(contents, map_location="cpu", weights_only=True)
             return dict(loaded["state"]), dict(loaded["facts"])
     except FileNotFoundError as error:
         raise CheckpointError(f"{path}: there is no such checkpoint") from error
@@ -86,8 +89,15 @@ def load_weights(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     if "reports" in facts:
         raise CheckpointError(f"{path}: holds a full training state, as last.pt does, not the best weights")
     for name, weight in weights.items():
-        if isinstance(weight, torch.Tensor) and not torch.isfinite(weight).all():
-            raise CheckpointError(f"{path}: holds weights that are not finite, in {name}")
+        if not isinstance(name, str):
+            raise CheckpointError(f"{path}: names weights {name!r}, but names must be strings")
+        if isinstance(weight, torch.Tensor):
+            # Others would fail, or take memory that the file does not.
+            is_dense = weight.layout == torch.strided and weight.device.type == "cpu" and not weight.is_quantized
+            if not is_dense or weight.nbytes > weight.untyped_storage().nbytes():
+                raise CheckpointError(f"{path}: holds weights that are no dense tensor of its own, in {name}")
+            if not torch.isfinite(weight).all():
+                raise CheckpointError(f"{path}: holds weights that are not finite, in {name}")
     return weights, facts
 
 
@@ -112,6 +122,16 @@ def _verified(file: io.BufferedReader, path: Path) -> BinaryIO:
     if hashlib.file_digest(file, "sha256").hexdigest().encode() != match[2]:
         raise CheckpointError(f"{path}: is damaged: its contents are not those that were written")
     return cast(BinaryIO, _OffsetFile(file, len(header)))
+
+
+def _check_uncompressed(contents: BinaryIO, path: Path) -> None:
+    """Raise `CheckpointError` if an archive takes more memory than space in the file, as torch never writes it."""
+    size = contents.seek(0, io.SEEK_END)
+    with zipfile.ZipFile(contents) as archive:
+        n_bytes = sum(each.file_size for each in archive.infolist())
+    if n_bytes > size:
+        raise CheckpointError(f"{path}: is not a checkpoint: {size} bytes of the file become {n_bytes}")
+    contents.seek(0)
 
 
 class _OffsetFile(io.RawIOBase):

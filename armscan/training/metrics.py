@@ -84,7 +84,7 @@ class MetricEstimates:
         for name, (statistic, value) in METRICS.items():
             measured = [getattr(episode, value) for episode in episodes]
             # Skip what was never measured.
-            if any(each is not None for each in measured) or not measured:
+            if any(each is not None for each in measured):
                 columns[name] = statistic, [math.nan if each is None else float(each) for each in measured]
         columns |= _by_expected_error(episodes)
         for name, (statistic, values) in list(columns.items()):

@@ -7,18 +7,22 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from armscan.errors import InvalidValueError
+from armscan.errors import InvalidValueError, few
 from armscan.training.fingerprints import Fingerprints
 from armscan.training.subject_splits import PHANTOMS, parts_by_subject
+from armscan.utils.text import counted
 from armscan.utils.validation import MAX_SEED, check_choice, check_int, check_path
 from armscan.volumes import Dataset, LabelVolume, load_phantoms, open_dataset
 from armscan.volumes.dataset import SPLITS
 from armscan.volumes.phantom import VERSIONS
+from armscan.volumes.phantom.generate import PHANTOM_NAME
 
 # Phantoms of different splits never have the same seed.
 VALIDATION_FIRST_SEED, TEST_FIRST_SEED = 1_000_000, 2_000_000
 
 PARTS = ("training", "validation", "test")
+# Volumes of a part that are listed by name.
+N_NAMED = 8
 
 
 @dataclass(frozen=True)
@@ -74,6 +78,18 @@ class Split:
     def parts(self) -> dict[str, dict[str, LabelVolume]]:
         """The volumes by part and name."""
         return {part: getattr(self, part) for part in PARTS}
+
+    @property
+    def names(self) -> str | None:
+        """The names of the volumes in each part, phantoms only counted; None if all are phantoms."""
+        of_parts = []
+        for part, volumes in self.parts.items():
+            own = [name for name in volumes if not PHANTOM_NAME.fullmatch(name)]
+            phantoms = [counted(len(volumes) - len(own), "phantom")] if len(own) < len(volumes) else []
+            of_parts.append((part, [few(own, N_NAMED)] * bool(own) + phantoms, bool(own)))
+        if not any(has_own for *_, has_own in of_parts):
+            return None
+        return "; ".join(f"{part}: {' and '.join(words)}" for part, words, _ in of_parts)
 
     def fingerprints(self) -> Fingerprints:
         """Return a checksum of each volume's contents, by part and name."""

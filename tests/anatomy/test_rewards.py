@@ -95,6 +95,26 @@ def test_agreement_reward_falls_where_the_published_one_stays_zero(agreement, da
     assert all(-1.0 <= found <= 0.0 for _, found in satisfied)
 
 
+def test_agreement_reward_costs_what_features_differ_from_the_labelled_planes():
+    labels = np.zeros((60, 1, 40), dtype=np.uint8)
+    labels[10:30, :, 4:20], labels[36:44, :, 24:32], labels[4:8, :, 34:38] = 1, 2, 3
+    volume = LabelVolume(labels, (0.5, 1.0, 0.25), "blocks", ManipulatorAction((0, 0), (0, 0)))
+    reward = AgreementReward().fit([volume])
+    bones, tendons, artery = TissueClusters.from_slice(volume.slice(volume.optimal_action)).landmarks[:, 1]
+    # Areas are free within 10 % and cost 1 at 50 % further; distances are free within 0.5 mm of 10, 4, 7 and 6 mm and
+    # cost 1 at 5 mm further. Counts and order are right, on both sides of the bones.
+    costs = [0.15 / 0.5, 0.15 / 0.5, 0.0, 1.5 / 5, 0.5 / 5, 3.5 / 5, 3.5 / 5]
+    for side in (-1, 1):
+        landmarks = np.array(
+            [
+                [4, 0.75 * bones, 30, 12],
+                [3, 1.25 * tendons, 30 + 24 * side, 24],
+                [1, 0.92 * artery, 30 - 6 * side, 52],
+            ]
+        )
+        assert reward.score(landmarks, volume.pixel_mm) == pytest.approx(-0.5 * sum(costs) / 7)
+
+
 def test_agreement_reward_is_minus_one_where_nothing_is_seen(agreement):
     assert agreement.score(np.zeros((3, 4)), (0.27, 0.55)) == -1.0
 

@@ -8,6 +8,7 @@ import mlflow.pyfunc
 import numpy as np
 import pytest
 
+from armscan.agents.policy import SAMPLING
 from armscan.policies.build import SUM_TAG
 from armscan.policies.model import model_sha256
 from armscan.runs.model_card import MAX_CHARS
@@ -47,8 +48,9 @@ def test_policy_of_an_earlier_run_is_exported_from_its_checkpoint(answer, tmp_pa
     assert answers.shape == (2, 2 if "projection=zy" in words else 1)
     assert np.abs(answers).max() <= 1
     said = model.metadata.metadata
-    # As the network itself answers, with all of its bits.
-    assert (said["run"], said["differs_from_agent"]) == (run_id, None)
+    # As the network itself answers, with all of its bits; the run's figures are those of sampled actions.
+    differs = SAMPLING if "agent.deterministic_eval=false" in words else None
+    assert (said["run"], said["differs_from_agent"]) == (run_id, differs)
     assert (tmp_path / "models" / "mine" / "policy.onnx").stat().st_size > 1000
     # A model of ours is replaced.
     assert answer("export", run_id, "--out=models/mine")[0] == 0

@@ -4,6 +4,9 @@ import contextlib
 import json
 import re
 import shlex
+import sqlite3
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
 import yaml
@@ -152,6 +155,48 @@ def test_grid_of_another_folder_is_not_resumed(tmp_path, monkeypatch):
     repeated = []
     resume([f"resume={run_id}", "--trust"], lambda *words, **trust: repeated.extend((*words, trust)))
     assert repeated == [["seed=1,2"], run_id, {"trust": True}]
+
+
+@pytest.fixture
+def elsewhere(monkeypatch):
+    """Start a server of a stranger's; return its address and the headers of the requests that it got."""
+    received = []
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self):
+            received.append(dict(self.headers))
+            self.send_error(404)
+
+        do_PUT = do_POST = do_GET  # noqa: N815 - as http.server calls them
+
+        def log_message(self, *_):
+            pass
+
+    monkeypatch.setenv("MLFLOW_TRACKING_USERNAME", "me")
+    monkeypatch.setenv("MLFLOW_TRACKING_PASSWORD", "secret")
+    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_address[1]}/api/2.0/mlflow-artifacts/artifacts/0", received
+        server.shutdown()
+
+
+def test_server_that_a_run_names_for_its_artifacts_is_sent_nothing(armscan, tmp_path, elsewhere):
+    uri, received = elsewhere
+    run_id = tracked(tmp_path)
+    (tmp_path / "theirs").mkdir()
+    with contextlib.closing(sqlite3.connect(tmp_path / "mlruns.db")) as database, database:
+        database.execute("UPDATE runs SET artifact_uri = ?", [f"{uri}/{run_id}/artifacts"])
+    for name in ("evaluate", "export", "register"):
+        code, _, errors = answered(armscan, name, run_id)
+        assert (code, f"the artifacts are in {uri}" in errors) == (2, True)
+    assert "they cannot be read" in armscan("runs", "show", run_id)[1]
+    outbox = Outbox.begin(tmp_path / "theirs", Address(run_id, f"sqlite:///{tmp_path}/mlruns.db"))
+    (tmp_path / "theirs/x.txt").touch()
+    outbox.add(file=["x.txt", None])
+    outbox.close()
+    for trust in ([], ["--trust"]):
+        assert f"the artifacts are in {uri}" in armscan("runs", "sync", "theirs", *trust)[1]
+    assert received == []
 
 
 def test_server_that_only_a_folder_names_is_sent_nothing(armscan, tmp_path, monkeypatch):

@@ -79,6 +79,14 @@ def test_words_with_a_password_are_refused_and_others_are_not():
     check_words(["a=b", "storage=postgresql://me@host/db", "x=http://host/a?b=c", "a:b@c"])
     with pytest.raises(InvalidValueError, match=r"^storage has a password in its address"):
         check_words(["storage='postgresql://me:secret@host/db'"])
+    for value in (
+        "sqlite:///mlruns.db,postgresql://me:secret@host/db",
+        "{uri: 'http://me:secret@host'}",
+        r"postgresql\://me\:secret@host/db",
+    ):
+        with pytest.raises(InvalidValueError, match=r"^tracking.uri has a password in its address"):
+            check_words([f"tracking.uri={value}"])
+    check_words(["tracking.uri=http://host:5000,http://host:5001/a@b"])
 
 
 def test_service_is_where_the_environment_says(monkeypatch):

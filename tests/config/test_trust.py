@@ -2,6 +2,7 @@
 
 import copy
 import functools
+import re
 
 import pytest
 from hypothesis import given
@@ -11,6 +12,7 @@ from omegaconf import OmegaConf
 from armscan.config.compose import compose
 from armscan.config.defaults import to_plain
 from armscan.config.trust import (
+    check_artifact_address,
     check_composed,
     check_stored_address,
     check_stored_words,
@@ -136,9 +138,28 @@ def test_composed_configuration_builds_what_a_file_here_names_and_nothing_else(t
         check_composed(config | {"agent": {"_target_": "joblib.load"}}, where="job 1")
 
 
-@pytest.mark.parametrize("uri", ["http://elsewhere:5000", "postgresql://me@elsewhere/db", "mysql://elsewhere/db"])
+@pytest.mark.parametrize(
+    "uri", ["http://elsewhere:5000", "postgresql://me@elsewhere/db", "mysql://elsewhere/db", "sqlite:////theirs.db"]
+)
 def test_password_is_sent_to_no_server_that_a_folder_names(uri):
-    with pytest.raises(UntrustedError, match=f"could be sent this user's passwords: give --tracking {uri}"):
+    with pytest.raises(UntrustedError, match=f"could be sent this user's passwords, .* give --tracking {uri}"):
         check_stored_address(uri, {STORE})
     check_stored_address(uri, {STORE, uri})
-    check_stored_address("sqlite:////mlruns.db", {STORE})
+
+
+@pytest.mark.parametrize("store", [STORE, "sqlite:////mlruns.db"])
+@pytest.mark.parametrize(
+    "uri", ["http://elsewhere:5000/a", "mlflow-artifacts://elsewhere/a", "runs:/0/a", "sftp://elsewhere/a"]
+)
+def test_password_is_sent_to_no_server_that_a_run_names_for_its_artifacts(uri, store):
+    with pytest.raises(UntrustedError, match=re.escape(f"the artifacts are in {uri}, but in a store at {store}")):
+        check_artifact_address(uri, store)
+    for own in ("/a", "file:///a", "s3://bucket/a"):
+        check_artifact_address(own, store)
+
+
+@pytest.mark.parametrize("uri", ["mlflow-artifacts:/0/a", f"{STORE}/api/2.0/mlflow-artifacts/artifacts/0/a"])
+def test_artifacts_may_be_on_the_server_of_their_store_alone(uri):
+    check_artifact_address(uri, STORE)
+    with pytest.raises(UntrustedError, match="another would be sent this user's password"):
+        check_artifact_address(uri, "sqlite:////mlruns.db")

@@ -43,7 +43,7 @@ class Scripted(gym.Env):
     """An environment that gives the rewards it is told."""
 
     observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
-    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+    action_space = gym.spaces.Box(-1, 1, (2,), np.float32)
 
     def __init__(self, rewards):
         self._rewards = iter(rewards)
@@ -54,7 +54,7 @@ class Scripted(gym.Env):
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        return self._answer([0.0])
+        return self._answer([0.0, 0.0])
 
     def step(self, action):
         observed, info = self._answer(action)
@@ -62,7 +62,14 @@ class Scripted(gym.Env):
 
 
 def best_pairs(observed):
-    return np.round(observed[2:].reshape(-1, 2).astype(float), 6).tolist()
+    pairs = np.round(observed[2:].reshape(-1, 3).astype(float), 6)
+    # The second component falls while the first one rises, so that neither orders the pairs.
+    np.testing.assert_array_equal(pairs[:, 1], -pairs[:, 0])
+    return pairs[:, [0, 2]].tolist()
+
+
+def opposed(value):
+    return np.array([value, -value])
 
 
 def test_memory_keeps_the_best_pairs_best_first_and_the_earlier_of_equals():
@@ -70,17 +77,17 @@ def test_memory_keeps_the_best_pairs_best_first_and_the_earlier_of_equals():
     observed, _ = env.reset()
     assert best_pairs(observed) == [[0.0, -0.5]] * 3
     # Worse than the worst kept, and as good as it: neither enters.
-    assert best_pairs(env.step(np.array([0.1]))[0]) == [[0.0, -0.5]] * 3
-    assert best_pairs(env.step(np.array([0.2]))[0]) == [[0.0, -0.5]] * 3
-    assert best_pairs(env.step(np.array([0.3]))[0]) == [[0.3, -0.25], [0.0, -0.5], [0.0, -0.5]]
-    assert best_pairs(env.step(np.array([0.4]))[0]) == [[0.3, -0.25], [0.4, -0.25], [0.0, -0.5]]
-    assert best_pairs(env.step(np.array([0.5]))[0]) == [[0.3, -0.25], [0.4, -0.25], [0.0, -0.5]]
+    assert best_pairs(env.step(opposed(0.1))[0]) == [[0.0, -0.5]] * 3
+    assert best_pairs(env.step(opposed(0.2))[0]) == [[0.0, -0.5]] * 3
+    assert best_pairs(env.step(opposed(0.3))[0]) == [[0.3, -0.25], [0.0, -0.5], [0.0, -0.5]]
+    assert best_pairs(env.step(opposed(0.4))[0]) == [[0.3, -0.25], [0.4, -0.25], [0.0, -0.5]]
+    assert best_pairs(env.step(opposed(0.5))[0]) == [[0.3, -0.25], [0.4, -0.25], [0.0, -0.5]]
 
 
 def test_memory_is_emptied_at_reset():
     env = BestActionMemory(Scripted([-0.5, -0.25, -0.75]), 2)
     env.reset()
-    env.step(np.array([0.3]))
+    env.step(opposed(0.3))
     assert best_pairs(env.reset()[0]) == [[0.0, -0.75]] * 2
 
 
@@ -146,7 +153,8 @@ def test_stack_begins_anew_with_each_episode(wrist):
 
 
 @pytest.mark.parametrize(
-    ("flat", "exclude"), [(True, ["action"]), (False, ["clusters"]), (False, "action"), (False, [["action"]])]
+    ("flat", "exclude"),
+    [(True, ["action"]), (True, [""]), (False, ["clusters"]), (False, "action"), (False, [["action"]])],
 )
 def test_stack_refuses_to_leave_out_what_is_not_there(wrist, flat, exclude):
     with pytest.raises(InvalidValueError, match="stack_exclude is"):
@@ -158,10 +166,9 @@ def test_memory_is_a_part_of_a_dict(wrist):
     pairs = []
     for (bare, _), (observed, info) in zip(steps(image_env(wrist)), steps(env), strict=True):
         pair = np.array([*info["action"], info["reward"]], np.float32)
-        if not pairs:
-            pairs = [pair, pair]
-        elif pair[-1] > pairs[-1][-1]:
-            pairs = sorted([pairs[0], pair], key=lambda kept: -kept[-1])
+        # No later plane is better than the first.
+        pairs = pairs or [pair, pair]
+        assert pair[-1] <= pairs[-1][-1]
         np.testing.assert_array_equal(observed.pop("memory"), np.concatenate(pairs))
         assert observed.keys() == bare.keys()
         for name, part in bare.items():

@@ -1,10 +1,15 @@
 """The agents of evaluations: from a run with its checkpoint, or a baseline by its name."""
 
+import io
 import json
+import zipfile
+from functools import partial
 
 import pytest
+import torch
 
 from armscan.training import load_checkpoint, save_checkpoint
+from armscan.utils.files import sha256
 from tests.support.refusals import assert_refused
 from tests.support.tracked_runs import GUESSER, store_of, tracked
 from tests.test_run import runs_in
@@ -71,9 +76,28 @@ def test_runs_that_have_kept_too_little_are_refused_with_what_to_do(evaluate, tm
         )
 
 
+NOT_DENSE = "holds weights that are no dense tensor of its own,"
+
+
 def with_nan(weights, facts):
     name = next(iter(weights))
     return weights | {name: weights[name] * float("nan")}, facts
+
+
+def with_n_env_steps(n_env_steps, weights, facts):
+    return weights, facts | {"n_env_steps": n_env_steps}
+
+
+def test_checkpoint_that_is_larger_in_memory_than_on_disk_is_refused(evaluate, tmp_path):
+    run_id = tracked(tmp_path)
+    contents, packed = io.BytesIO((tmp_path / "best.pt").read_bytes().partition(b"\n")[2]), io.BytesIO()
+    with zipfile.ZipFile(contents) as archive, zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as compressed:
+        for name in archive.namelist():
+            compressed.writestr(name, archive.read(name) + b"0" * 10**6)
+    header = f"armscan checkpoint 1 {sha256(packed.getvalue())}\n".encode()
+    (tmp_path / "best.pt").write_bytes(header + packed.getvalue())
+    store_of(tmp_path).log_artifact(run_id, str(tmp_path / "best.pt"))
+    assert_refused(evaluate(run_id), f"run {run_id}: best.pt: is not a checkpoint: {len(packed.getvalue())} bytes of")
 
 
 @pytest.mark.parametrize(
@@ -90,6 +114,14 @@ def with_nan(weights, facts):
         (lambda weights, facts: ({"other": 1}, facts), "the checkpoint is another agent's or network's"),
         (lambda weights, facts: ([1], facts), "best.pt: is not a checkpoint: it contains something other"),
         (with_nan, "best.pt: holds weights that are not finite, in "),
+        (lambda weights, facts: (weights | {"w": torch.zeros(1).expand(10**12)}, facts), f"best.pt: {NOT_DENSE} in w"),
+        (lambda weights, facts: (weights | {"w": torch.zeros(3).to_sparse()}, facts), f"best.pt: {NOT_DENSE} in w"),
+        (lambda weights, facts: (weights | {"w": torch.zeros(3, device="meta")}, facts), f"best.pt: {NOT_DENSE} in w"),
+        (lambda weights, facts: (weights | {3: 1}, facts), "best.pt: names weights 3, but"),
+        *(
+            (partial(with_n_env_steps, n), f"its checkpoint has n_env_steps = {n!r}, but it must be a whole number")
+            for n in ("abc", float("inf"), -5, 2**70)
+        ),
     ],
 )
 def test_checkpoints_that_are_none_of_the_run_are_refused_before_anything_is_tracked(evaluate, tmp_path, change, line):

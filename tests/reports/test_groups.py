@@ -54,9 +54,7 @@ def test_groups_that_no_key_tells_apart_have_numbers(make_training):
     # As where a key is new.
     trainings = [make_training(params=each) for each in ({}, {"a": "1"}, {"b": "1"})]
     assert names(*trainings) == ["sac", "a=1", "b=1"]
-    assert names(*trainings[:1], make_training(params={"a": "1"}), make_training(params={"b": "1"}, choices={})) == [
-        *("sac", "a=1", "b=1")
-    ]
+    assert names(make_training(name="a=1"), make_training(params={"a": "1"})) == ["a=1 (1)", "a=1 (2)"]
     long = [make_training(params={"data.path": "x" * 200 + end}) for end in "ab"]
     labels = [group.label for group in group_trainings(long)[0]]
     assert len(set(labels)) == 2
@@ -72,7 +70,14 @@ def test_of_several_runs_with_the_same_seed_one_counts(make_training):
 
 
 @pytest.mark.parametrize(
-    ("key", "is_rule"), [("env.success_threshold", True), ("projection", True), ("agent.lr", False)]
+    ("key", "is_rule"),
+    [
+        ("env.success_threshold", True),
+        ("projection", True),
+        ("agent.lr", False),
+        ("env.observation.normalised", False),
+        ("env.stack", False),
+    ],
 )
 def test_rules_that_differ_are_known(make_training, key, is_rule):
     groups, _ = group_trainings([make_training(params={key: value}) for value in "12"])

@@ -98,6 +98,8 @@ def test_wilson_is_that_of_scipy_and_has_a_width_at_the_ends():
 def test_estimates_refuse_columns_that_do_not_fit(volumes):
     with pytest.raises(InvalidValueError, match="one value for each episode"):
         estimates({"m": (mean, [1.0, 2.0])}, volumes)
+    with pytest.raises(InvalidValueError, match="one value for each episode"):
+        estimates({"m": (mean, [])}, [])
 
 
 @pytest.mark.parametrize("trainings", [None, ["a"] * 40])

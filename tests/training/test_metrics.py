@@ -5,6 +5,7 @@ import dataclasses
 import pytest
 
 from armscan.training import Evaluation, MetricEstimates
+from armscan.training.metrics import SEEDS
 from tests.training.test_train import episode_of, evaluation_of
 
 
@@ -26,6 +27,21 @@ def test_figures_agree_with_the_metrics_of_training():
     assert metrics["mean_steps_low"] <= 18.0 <= metrics["mean_steps_high"]
     assert metrics["mean_dice_artery"] == pytest.approx(0.7)
     assert metrics["success_rate_wilson_low"] == pytest.approx(0.4385, abs=1e-4)
+
+
+def test_figures_of_several_trainings_are_the_same_once_they_are_tracked():
+    trainings = {seed: evaluation_of(1 + seed, 3, 50) for seed in (0, 1)}
+    figures = MetricEstimates.of_trainings(trainings)
+    metrics = figures.metrics()
+    assert (figures.n_seeds, metrics[SEEDS]) == (2, 2)
+    again = MetricEstimates.of_metrics(metrics)
+    assert again.counts == figures.counts
+    assert again.metrics() == pytest.approx(metrics, nan_ok=True)
+    assert again.estimates.keys() == figures.estimates.keys()
+    # All succeed, so only Wilson's interval has a width.
+    sure = MetricEstimates.of(evaluation_of(1, 3))
+    assert sure.estimate("success_rate") == sure.estimates["success_rate_wilson"]
+    assert SEEDS not in sure.metrics()
 
 
 def test_figures_of_episodes_that_all_start_solved_are_not_those_of_others():

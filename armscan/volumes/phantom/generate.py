@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import NamedTuple
 
 import numpy as np
@@ -88,6 +89,9 @@ def make_phantom(seed: int, version: int = 1) -> LabelVolume:
         fill_tube(labels, SPACING_MM, plane.matrix, pose.origin_mm, pose.place(tube).nodes, tube.label)
     _scatter_strays(labels, rng)
     return LabelVolume(labels, SPACING_MM, name, optimal_action=action)
+
+
+PHANTOM_NAME = re.compile(r"phantom-(v\d+-)?\d+")
 
 
 def phantom_name(seed: int, version: int) -> str:
