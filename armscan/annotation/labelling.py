@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +29,8 @@ from armscan.volumes.markups import MARKUP_SUFFIX
 
 # Distance in mm and degrees below which two planes are the same: what writing and reading a file rounds.
 SAME = 1e-3
+# Finds the plane of a volume.
+Search = Callable[[LabelVolume], FoundPlane]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +46,8 @@ class LabellingOptions:
         markups: Whether to write a markups file for 3D Slicer beside each picture.
         markup: Markups file with the plane of `volume`, which replaces the search.
         volume: Name of the volume that `markup` is for; it may already have a plane.
+        search: Function that takes the volumes to label by name, and returns one that finds the plane of a volume.
+            Default: None, `find_optimal_plane`.
     """
 
     data: Path
@@ -52,6 +58,7 @@ class LabellingOptions:
     markups: bool = False
     markup: Path | None = None
     volume: str | None = None
+    search: Callable[[Mapping[str, LabelVolume]], Search] | None = None
 
 
 def label(options: LabellingOptions) -> tuple[list[tuple[LabelVolume, FoundPlane]], list[ArmscanError]]:
@@ -65,15 +72,13 @@ def label(options: LabellingOptions) -> tuple[list[tuple[LabelVolume, FoundPlane
     volumes = _wanted(options, dataset)
     if options.markups and options.markup is None:
         _write_known_markups(options, dataset.volumes, set(volumes))
+    find = _search(options, volumes)
     labelled: list[tuple[LabelVolume, FoundPlane]] = []
     failures: list[ArmscanError] = []
     for number, (name, volume) in enumerate(volumes.items(), 1):
         print(f"{number}/{len(volumes)}  {name}", flush=True)
         try:
-            if options.markup is not None:
-                plane = _drawn(options.markup, volume, options.tissues)
-            else:
-                plane = find_optimal_plane(volume, success_threshold=SUCCESS_THRESHOLD, clustering=options.tissues)
+            plane = find(volume)
         # The latter: the clustering rules are none for its spacing.
         except (OptimalPlaneError, InvalidValueError) as error:
             failures.append(error)
@@ -102,7 +107,16 @@ def _wanted(options: LabellingOptions, dataset: Dataset) -> dict[str, LabelVolum
     return {name: volume for name, volume in wanted.items() if volume.optimal_action is None}
 
 
-def _drawn(markup: Path, volume: LabelVolume, tissues: Tissues) -> FoundPlane:
+def _search(options: LabellingOptions, volumes: dict[str, LabelVolume]) -> Search:
+    """Return the function that finds or reads the plane of each of these volumes."""
+    if options.markup is not None:
+        return partial(_drawn, options.markup, options.tissues)
+    if options.search is not None and volumes:
+        return options.search(volumes)
+    return partial(find_optimal_plane, success_threshold=SUCCESS_THRESHOLD, clustering=options.tissues)
+
+
+def _drawn(markup: Path, tissues: Tissues, volume: LabelVolume) -> FoundPlane:
     action = read_markup(markup, volume)
     return FoundPlane(action, *PlaneScorer(volume, LandmarkReward(), tissues).score(action))
 

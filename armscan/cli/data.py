@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,7 +11,14 @@ import click
 from rich.table import Column, Table
 from rich.text import Text
 
-from armscan.cli.options import FILE_PATH, CommaSeparated, clustering_option, examples
+from armscan.cli.options import (
+    FILE_PATH,
+    CommaSeparated,
+    clustering_option,
+    examples,
+    tracking_option,
+    trust_option,
+)
 from armscan.errors import InvalidValueError, print_error
 from armscan.utils.console import WHOLE_CHARS, print_sentence, print_table, wide_console
 from armscan.utils.text import counted
@@ -58,7 +66,10 @@ def inspect(folder: Path) -> None:
 @click.option("--markups", is_flag=True, help="Write each plane as a markups file (.mrk.json) for 3D Slicer, too.")
 @click.option("--markup", type=FILE_PATH, metavar="FILE", help="Read the plane of --volume from this markups file.")
 @click.option("--volume", metavar="NAME", help="Volume of --markup.")
+@click.option("--agent", metavar="RUN", help="Let the agent of this run find the planes, instead of the search.")
 @clustering_option
+@tracking_option(help="MLflow tracking store of --agent.")
+@trust_option
 def label(
     folder: Path,
     volumes: tuple[str, ...] | None,
@@ -67,7 +78,10 @@ def label(
     markups: bool,
     markup: Path | None,
     volume: str | None,
+    agent: str | None,
     clustering: str | None,
+    tracking: str,
+    trust: bool,
 ) -> int:
     """Find the optimal planes of the volumes in FOLDER.
 
@@ -76,8 +90,8 @@ def label(
     """
     if (markup is None) != (volume is None):
         raise click.UsageError("--markup and --volume must be given together: which file, and for which volume")
-    if markup is not None and (volumes or overwrite):
-        idle = "--volumes" if volumes else "--overwrite"
+    if markup is not None and (volumes or overwrite or agent):
+        idle = "--volumes" if volumes else "--overwrite" if overwrite else "--agent"
         raise click.UsageError(f"{idle} is for a search, but --markup and --volume say which plane and for what")
     if pictures is None and (folder / PICTURES).is_symlink():
         # Otherwise the author of the data folder would choose where pictures are written.
@@ -95,6 +109,7 @@ def label(
         markups=markups,
         markup=markup,
         volume=volume,
+        search=None if agent is None else partial(_agent_search, agent, tracking, trust),
     )
     labelled, failures = label_planes(options)
     if labelled:
@@ -106,6 +121,15 @@ def label(
     for failure in failures:
         print_error(str(failure))
     return 2 if failures else 0
+
+
+def _agent_search(
+    run: str, tracking: str, trust: bool, volumes: Mapping[str, LabelVolume]
+) -> Callable[[LabelVolume], FoundPlane]:
+    from armscan.evaluation import agent_of_run
+    from armscan.evaluation.unlabelled import agent_search
+
+    return agent_search(agent_of_run(tracking, run, {}, trust=trust), dict(volumes))
 
 
 @data.command(epilog=examples("data explore wrists --volume a.nii.gz"))

@@ -12,6 +12,7 @@ from armscan.anatomy import find_optimal_plane
 from armscan.cli.main import main
 from armscan.envs import ArmscanEnv
 from armscan.volumes import ManipulatorAction, open_dataset, plane_distance, read_markup, read_volume, write_markup
+from tests.support.tracked_runs import tracked
 
 
 @pytest.fixture
@@ -63,6 +64,18 @@ def test_label_writes_planes_pictures_and_markups_and_says_what_to_do(bare, name
     said = capsys.readouterr().out
     for word in ("0.000", "4, 3, 1", "accept", "reject", "exclude", "--markup FILE.mrk.json"):
         assert word in said
+
+
+def test_label_takes_the_planes_that_an_agent_finds(bare, names, database, tmp_path, capsys):
+    run_id = tracked(tmp_path, "projection=full")
+    store = f"--tracking=sqlite:///{tmp_path}/mlruns.db"
+    assert main(["data", "label", str(bare), f"--agent={run_id[:8]}", store, f"--volumes={names[1]}"]) == 0
+    assert planes(bare)[names[0]] is None
+    assert planes(bare)[names[1]] is not None
+    assert "planes written into the manifest" in capsys.readouterr().out
+    assert "and its environment holds rz, rx or tx at the labelled plane" in refused(
+        [str(bare), f"--agent={tracked(tmp_path)}", store], capsys
+    )
 
 
 def test_label_leaves_planes_that_are_there_unless_told_otherwise(bare, names, quick, capsys):
@@ -142,6 +155,7 @@ def test_label_keeps_a_markups_file_with_a_plane_that_a_person_has_moved(bare, n
         (["x", "--markup=y"], "--markup and --volume must be given together"),
         (["x", "--volume=y"], "--markup and --volume must be given together"),
         (["x", "--markup=y", "--volume=z", "--overwrite"], "--overwrite is for a search"),
+        (["x", "--markup=y", "--volume=z", "--agent=a"], "--agent is for a search"),
         (["x", "--markup=y", "--volume=z", "--volumes=z"], "--volumes is for a search"),
         (["007[${x}"], "007[${x}: the folder of volumes does not exist"),
         (["/no/such/folder"], "/no/such/folder: the folder of volumes does not exist"),
