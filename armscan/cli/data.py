@@ -165,10 +165,8 @@ def _print_dataset(dataset: Dataset, folder: Path) -> None:
         console.print(Text(f"{name}: subject {dataset.subjects[name]}, {split}{plane}", style="bold"))
         console.print(Text(_geometry(report)))
         console.print(_tissue_table(report))
-        if not report.has_palm_at_high_z:
-            console.print(
-                Text("note: the palm is at low z, in phantoms at high z; orientation in the manifest flips it")
-            )
+        for note in report.notes:
+            console.print(Text(f"note: {note}"))
     for name, reason in dataset.excluded.items():
         console.print(Text(f"{name}: excluded" + ("" if reason == "True" else f" ({reason})")))
     n_volumes, n_subjects = len(dataset.reports), len(set(dataset.subjects.values()))
@@ -249,6 +247,11 @@ def _print_planes(options: LabellingOptions, labelled: Sequence[tuple[LabelVolum
     names = [volume.name for volume, _ in labelled]
     print_table("volume", names, [Column(heading, justify="right") for heading in headings], rows)
     for volume, plane in labelled:
+        if (before := volume.optimal_action) is not None:
+            rz, rx, tx, ty = before.to_array()
+            print_sentence(
+                f"note: {volume.name} had the plane rotation: [{rz:g}, {rx:g}], translation: [{tx:g}, {ty:g}]"
+            )
         if plane.score <= -SUCCESS_THRESHOLD:
             wanted = f"an environment requires more than {-SUCCESS_THRESHOLD:g}"
             print_sentence(f"note: {volume.name} scores {plane.score:.3f}, and {wanted}")

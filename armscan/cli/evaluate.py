@@ -171,6 +171,8 @@ def _evaluate(
     tables = report.tables()
     for label, table in tables.items():
         notes = [] if label == TRAINING else few_wrists({"": report.by_split[label]})
+        if label in prepared.own:
+            notes.append("the agent's run has used some of these volumes, so this is no result on new wrists")
         print_result_table(label, table, notes, how=label == [*tables][-1], of=label)
     print_where_to_look(Path.cwd(), store["uri"], files=(str(file),))
 

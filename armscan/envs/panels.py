@@ -96,6 +96,11 @@ def _outlines(codes: NDArray[np.int32]) -> NDArray[np.bool_]:
     return edges
 
 
+def is_right_handed(volume: LabelVolume) -> bool:
+    """Return whether the axes of a volume are right-handed in the world, so that its slices are seen from low Y."""
+    return bool(np.linalg.det(volume.direction) > 0)
+
+
 def side_panels(
     volume: LabelVolume,
     transform: RigidTransform | None,
@@ -113,9 +118,9 @@ def side_panels(
             the last one is on top.
         rooms: Size (width, height) in pixels that each picture fits into; its aspect ratio is kept.
     """
-    is_right_handed = np.linalg.det(volume.direction) > 0
+    is_flipped = is_right_handed(volume)
     if volume not in _SIDES:
-        labels = volume.labels[::-1] if is_right_handed else volume.labels
+        labels = volume.labels[::-1] if is_flipped else volume.labels
         from_palm, from_side = _first_seen(labels[:, :, ::-1], 2), _first_seen(labels, 0)
         _SIDES[volume] = TISSUE_INKS[from_palm.T], TISSUE_INKS[from_side]
     across_mm, along_mm, depth_mm = volume.size_mm
@@ -127,7 +132,7 @@ def side_panels(
     )
     for action, ink, line_width in planes:
         corners_mm = _corners_mm(volume, transform, action)
-        if is_right_handed:
+        if is_flipped:
             corners_mm[:, 0] = across_mm - corners_mm[:, 0]
         for picture, axes in ((frontal, [0, 1]), (sagittal, [2, 1])):
             corners = corners_mm[:, axes] * picture.size / np.array(volume.size_mm)[axes]

@@ -20,6 +20,7 @@ from armscan.envs.panels import (
     PLANE_INK,
     TISSUE_INKS,
     font,
+    is_right_handed,
     reward_panel,
     side_panels,
     slice_panel,
@@ -99,9 +100,11 @@ def draw_plane(
     draw = ImageDraw.Draw(picture)
     planes = [] if beside is None else [(beside.action, OPTIMUM_INK, 1)]
     planes.append((plane, PLANE_INK, 2))
+    # With fingers at low Y, as in phantoms.
+    seen_from = "fingers" if is_right_handed(volume) else "elbow"
     frontal, sagittal = side_panels(volume, transform, planes, (_room(FRONTAL_BOX), _room(SAGITTAL_BOX)))
     for box, title, panel in (
-        (SLICE_BOX, "slice, palm up", slice_panel(view, _room(SLICE_BOX))),
+        (SLICE_BOX, f"slice, palm up, from the {seen_from}", slice_panel(view, _room(SLICE_BOX))),
         (FRONTAL_BOX, "frontal, from the palm", frontal),
         (SAGITTAL_BOX, "sagittal", sagittal),
     ):

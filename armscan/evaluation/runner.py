@@ -45,6 +45,7 @@ class PreparedAgent:
         notes: Differences from its training, one sentence each.
         data: Folder of the volumes, `phantom`, or None for the volumes of the agent's own configuration.
         is_new: Whether the agent's run has used none of the volumes. Default: False.
+        own: Names of those environments that have volumes which the agent's run has used. Default: none.
     """
 
     source: EvaluatedAgent
@@ -53,6 +54,7 @@ class PreparedAgent:
     notes: tuple[str, ...]
     data: str | None = None
     is_new: bool = False
+    own: tuple[str, ...] = ()
 
     def evaluate(
         self, n_episodes: int, seed: int, tell: Callable[[str], None] = lambda _: None
@@ -107,13 +109,16 @@ def prepare_agent(
     check(groups)
     prepared = prepare_on_volumes(source, groups, own, render_mode=render_mode)
     notes = list(prepared.notes)
-    known = known_volumes(source, groups) if data and source.run else []
+    is_elsewhere = bool(data and source.run)
+    known = known_volumes(source, groups) if is_elsewhere else []
+    own_groups = [label for label in groups if is_elsewhere and known_volumes(source, {label: groups[label]})]
     notes += known
     if source.run and source.volumes is None and own.cache_info().currsize:
         notes.append("the run has no fingerprints of its volumes, so these may have changed since")
     for note in notes:
         print_sentence(printable(f"note: {note}"))
-    return replace(prepared, notes=tuple(notes), data=data, is_new=data is not None and not known)
+    is_new = data is not None and not known
+    return replace(prepared, notes=tuple(notes), data=data, is_new=is_new, own=tuple(own_groups))
 
 
 def prepare_on_volumes(

@@ -11,7 +11,7 @@ from armscan.config.defaults import ADDED, FOLD, NOT_COMPARED
 from armscan.reports.load import TrackedTraining
 
 LEFT_OUT = (*NOT_COMPARED, "data.cache_dir", FOLD)
-SEED_IN_NAME = re.compile(r"-seed\d+$")
+SEED_IN_NAME = re.compile(r"(-fold\d+)?-seed\d+$")
 MAX_LABEL_CHARS = 72
 # The sections that precede a key.
 SECTIONS = re.compile(r"[\w.]+\.(?=\w+=)")

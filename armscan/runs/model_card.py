@@ -56,7 +56,8 @@ class Card:
         tags: dict[str, str] = {}
         for title, report in reports.items():
             notes = "".join(f"\n\nNote: {note}." for note in report.facts.get("notes", ()))
-            section = f"\n\n### {title}\n\n{_table(report).markdown()}{notes}"
+            result = report.tables()[_label(report)].headline
+            section = f"\n\n### {title}\n\n{result}\n\n{_table(report).markdown()}{notes}"
             # If there is no room for both, the run's own evaluation stays.
             if len(text + section) <= MAX_CHARS:
                 text += section
@@ -138,11 +139,15 @@ def _evaluations(episodes: Mapping[str, object], limits: object) -> dict[str, Ev
 
 
 def _table(report: EvaluationReport) -> ResultTable:
-    """Return the agent on all volumes, and the baselines on the last of them: the test volumes, or all of a folder."""
-    figures = dict(report.by_split)
-    label = TEST if TEST in figures else list(figures)[-1]
+    """Return the agent on all volumes, and the baselines on those of `_label`."""
+    figures, label = dict(report.by_split), _label(report)
     baselines = {name: each[label] for name, each in report.baselines_by_split.items() if label in each}
     return ResultTable({**figures, **{f"{name}, {label}": each for name, each in baselines.items()}})
+
+
+def _label(report: EvaluationReport) -> str:
+    """Return the name of the volumes that count: the test volumes, or all of a folder."""
+    return TEST if TEST in report.by_split else list(report.by_split)[-1]
 
 
 def _damaged(run_id: str, file: str) -> TrackingError:

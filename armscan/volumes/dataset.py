@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -150,5 +151,6 @@ def _manifest_of(path: str | Path, *, require_manifest: bool) -> tuple[Path | No
         return found, read_manifest(found), files
     if require_manifest:
         names = listed(MANIFEST_NAMES)
-        raise ManifestError(f"{folder}: the folder has no manifest ({names}); armscan data label {folder} writes one")
+        command = f"armscan data label {shlex.quote(str(folder))}"
+        raise ManifestError(f"{folder}: the folder has no manifest ({names}); {command} writes one")
     return None, Manifest(), files

@@ -133,8 +133,8 @@ def map_values(
     if unnamed := [value for value, label in table.items() if label is None]:
         if labels is None:
             raise VolumeError(
-                f"{where}: holds the values {shown(counts)}, but {ALLOWED_LABELS} only; a label map says what other "
-                "values are"
+                f"{where}: holds the values {shown(counts)}, but {ALLOWED_LABELS} only; if it is no image, say what "
+                "they are in the folder's manifest.yaml: labels: {bones: [...], tendons: [...], artery: [...]}"
             )
         raise VolumeError(
             f"{where}: holds {shown(unnamed)}, which the label map does not name; every value must be named, or others "

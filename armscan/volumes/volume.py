@@ -223,7 +223,8 @@ def _checked_labels(labels: NDArray[np.generic], name: str) -> NDArray[np.uint8]
     for label in LANDMARK_LABELS:
         if not (checked == label).any():
             raise VolumeError(
-                f"{name}: no voxel is labelled {label} ({LABEL_NAMES[label]}), but every landmark is required"
+                f"{name}: no voxel is labelled {label} ({LABEL_NAMES[label]}), but every landmark is required; "
+                "exclude: REASON in its entry of the manifest leaves the volume out"
             )
     checked.flags.writeable = False
     return checked

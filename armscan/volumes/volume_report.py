@@ -61,13 +61,23 @@ class VolumeReport:
         return {tissue: counts.get(label, 0) for label, tissue in LABEL_NAMES.items() if label != BACKGROUND}
 
     @property
-    def has_palm_at_high_z(self) -> bool:
-        """Whether the tendons lie at higher z than the bones on average, as in phantoms; True without one of them."""
+    def notes(self) -> list[str]:
+        """What suggests that the axes are not those of phantoms, one sentence each."""
+        notes, size_mm = [], self.volume.size_mm
+        if size_mm[1] < max(size_mm):
+            sizes = " x ".join(f"{mm:.0f}" for mm in size_mm)
+            notes.append(f"y, along the arm, is not the longest of {sizes} mm; axes in the manifest orders them")
+        if not self._has_palm_at_high_z():
+            notes.append("the palm is at low z, in phantoms at high z; orientation in the manifest flips axes")
+        return notes
+
+    def _has_palm_at_high_z(self) -> bool:
+        """Return whether the tendons lie at higher z than the bones on average."""
         depths = range(self.volume.shape[2])
-        each = [(self.volume.labels == TISSUE_LABELS[tissue]).sum(axis=(0, 1)) for tissue in ("bones", "tendons")]
-        if not all(n_voxels.any() for n_voxels in each):
-            return True
-        bones, tendons = (np.average(depths, weights=n_voxels) for n_voxels in each)
+        bones, tendons = (
+            np.average(depths, weights=(self.volume.labels == TISSUE_LABELS[tissue]).sum(axis=(0, 1)))
+            for tissue in ("bones", "tendons")
+        )
         return bool(tendons > bones)
 
     @property

@@ -27,6 +27,7 @@ def test_data_command_tells_what_each_volume_holds(write_labelmap, tmp_path, mon
         "cropped to y from 0 to 4 mm",
         "b.nrrd: subject b.nrrd, for train, no labelled plane",
         "not there",
+        "note: y, along the arm, is not the longest of 9 x 4 x 6 mm; axes in the manifest orders them",
         "c.nrrd: excluded ([bold] motion)",
         "bones",
         "1 (231)",

@@ -55,6 +55,7 @@ def test_own_volumes_that_have_changed_are_refused_where_they_matter(evaluate, t
         assert (code, errors) == (0, "")
         known = ", ".join(manifest["splits"]["train"])
         assert f"note: the agent was trained on these volumes: {known}\n" in printed
+        assert "has used some of these volumes, so this is no result on new wrists" in " ".join(printed.split())
         # They are never pooled with others, and the page says so, too.
         assert "all volumes" not in written(tmp_path)["splits"]
         (page,) = (tmp_path / "evaluations").glob("*.html")

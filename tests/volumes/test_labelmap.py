@@ -88,7 +88,7 @@ def test_read_volume_refuses_a_landmark_that_the_map_finds_nowhere(write_labelma
 def test_read_volume_without_a_map_names_the_values_that_are_no_labels(write_labelmap, tiny_volume, value):
     stored = tiny_volume.labels.astype(np.int32)
     stored[0, 0, 0] = value
-    with pytest.raises(VolumeError, match=rf"wrist\.nii\.gz: holds the values .*{value}.* only; a label map says"):
+    with pytest.raises(VolumeError, match=rf"wrist\.nii\.gz: holds the values .*{value}.* only; if it is no image"):
         read_volume(write_labelmap(labels=stored))
 
 
