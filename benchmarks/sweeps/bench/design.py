@@ -75,6 +75,12 @@ def default_of(space: Space, config: DictConfig) -> dict[str, Value]:
     return {each.name: optuna_value(OmegaConf.select(config, each.name)) for each in space.parameters}
 
 
+def presets_of(sweep: str, space: Space) -> tuple[dict[str, Value], ...]:
+    """Return the values of the presets that the studies of a sweep try first, `study.enqueue`."""
+    names = compose([f"sweep={sweep}"]).study.enqueue
+    return tuple(default_of(space, compose([f"sweep={sweep}", f"experiment={name}"])) for name in names)
+
+
 def value_at(distribution: BaseDistribution, place: float) -> Value:
     """Return the value of a distribution at a place, its quantile from 0 to below 1."""
     if isinstance(distribution, CategoricalDistribution):

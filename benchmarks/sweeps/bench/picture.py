@@ -41,7 +41,7 @@ def draw(ranks: pd.DataFrame, races: Mapping[int, Races], keys: Mapping[str, Key
 
 
 def _draw_ranks(axes: Axes, ranks: pd.DataFrame) -> None:
-    names = [f"{row.sampler}" + (f", {row.n_seeds} seeds" if row.n_seeds > 1 else "") for row in ranks.itertuples()]
+    names = [f"{row.sampler}{row.further}" for row in ranks.itertuples()]
     order = list(dict.fromkeys(names))[::-1]
     for place, pruner in enumerate(PRUNERS):
         is_drawn = (ranks.pruner == pruner).to_numpy()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import joblib
@@ -12,7 +13,8 @@ import pandas as pd
 
 from armscan.stats.aggregation import band_over_seeds, probability_of_improvement
 from armscan.utils.arrays import FloatArray
-from benchmarks.sweeps.bench.replay import Rule, choose, scores_of, search, silence
+from benchmarks.sweeps.bench.design import presets_of
+from benchmarks.sweeps.bench.replay import DEFAULT, Rule, choose, scores_of, search, silence
 from benchmarks.sweeps.bench.seed_rules import MAX_SEEDS
 from benchmarks.sweeps.bench.surrogate import SimulatedConfig, Surrogate
 
@@ -49,15 +51,16 @@ FINALS = {
 
 
 def rules(samplers: Sequence[str] = SAMPLERS) -> Iterator[Rule]:
-    """Yield the rules that are compared: each sampler with each pruner, then two samplers with two seeds a trial.
+    """Yield the rules that are compared: each sampler with each pruner, two with two seeds, the default with presets.
 
     Args:
         samplers: Names of groups `study/sampler`. Default: all but `gp`, which takes a hundred times longer than others
             to propose a trial.
     """
     whole = itertools.starmap(Rule, itertools.product(samplers, PRUNERS))
+    further = [Rule(each, "median", 2) for each in TWO_SEEDS] + [replace(DEFAULT, has_presets=True)]
     # Each rule once, the reference first.
-    yield from dict.fromkeys([REFERENCE, *whole, *(Rule(each, "median", 2) for each in TWO_SEEDS if each in samplers)])
+    yield from dict.fromkeys([REFERENCE, *whole, *(rule for rule in further if rule.sampler in samplers)])
 
 
 def studies_of(
@@ -86,11 +89,13 @@ def studies_of(
         the search and by each of `FINALS`, and the trainings of the latter.
     """
     _, best = surrogate.best()
+    presets = presets_of(sweep, surrogate.space)
 
     def row_of(rule: Rule, number: int) -> dict[str, Any]:
         if workers > 1:
             silence()
-        found = search(surrogate, sweep, rule, n_trainings=n_trainings, seed=number)
+        enqueued = presets if rule.has_presets else ()
+        found = search(surrogate, sweep, rule, n_trainings=n_trainings, seed=number, enqueued=enqueued)
         tops = [candidate.config for candidate in found.candidates[: max(final.top_k for final in FINALS.values())]]
         row = {**vars(rule), "study": number, "n_trials": found.n_trials, "search": tops[0].truth - best}
         scores = scores_of([control, *tops], MAX_SEEDS, np.random.default_rng(number))
@@ -128,6 +133,7 @@ def ranked(studies: pd.DataFrame, by: str = "race") -> pd.DataFrame:
         rows.append(
             {
                 **vars(rule),
+                "further": rule.further,
                 **dict(zip(("regret", "low", "high"), (float(end[0]) for end in regret), strict=True)),
                 **dict(zip(("better", "better_low", "better_high"), better, strict=True)),
                 **{name: float(of_rule[name].mean()) for name in columns},

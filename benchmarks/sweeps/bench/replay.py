@@ -33,11 +33,18 @@ class Rule:
         sampler: Name of a group `study/sampler`, such as `tpe`.
         pruner: Name of a group `study/pruner`, such as `median`.
         n_seeds: Trainings of each trial. Default: 1.
+        has_presets: Whether the first trials try the presets of the sweep (`study.enqueue`). Default: False.
     """
 
     sampler: str
     pruner: str
     n_seeds: int = 1
+    has_presets: bool = False
+
+    @property
+    def further(self) -> str:
+        """What distinguishes it apart from sampler and pruner, to be added to a name."""
+        return (f", {self.n_seeds} seeds" if self.n_seeds > 1 else "") + (", presets" if self.has_presets else "")
 
 
 # The rule of a study of armscan by default.

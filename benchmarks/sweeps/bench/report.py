@@ -143,7 +143,7 @@ def _print_races(top_k: int, fixed: Sequence[Choices], compared: Sequence[Compar
 def _print_ranks(ranks: pd.DataFrame) -> None:
     rows = [
         (
-            f"{row.sampler}, {row.pruner}" + (f", {row.n_seeds} seeds" if row.n_seeds > 1 else ""),
+            f"{row.sampler}, {row.pruner}{row.further}",
             with_interval((row.regret, row.low, row.high)),
             f"{row.fixed:.3f}",
             f"{row.control:.3f}",
