@@ -42,13 +42,13 @@ def run_command(words: Iterable[str]) -> str:
     return shlex.join([*typed(RUN[0]), *RUN[1:], *words])
 
 
-def resume_command(run_id: str, tracking_uri: str, *, trust: bool = False) -> str:
+def resume_command(run_id: str, tracking_uri: str, *, trust: bool) -> str:
     """Return the command that resumes a run.
 
     Args:
         run_id: MLflow run ID.
         tracking_uri: MLflow tracking URI of its store.
-        trust: Whether the command needs `--trust`. Default: False.
+        trust: Whether the command needs `--trust`.
     """
     where = () if _is_default_store(tracking_uri) else (f"{TRACKING_URI}={tracking_uri}",)
     return run_command([f"{RESUME}={run_id}", *where, *((TRUST,) if trust else ())])

@@ -62,7 +62,7 @@ def phantom_version(source: EvaluatedAgent) -> int:
 
 
 def volume_groups(
-    data: str | None, n_phantoms: int, own: Callable[[], Split], version: int = 1
+    data: str | None, n_phantoms: int, own: Callable[[], Split], version: int
 ) -> dict[str, VolumesByName]:
     """Return the volumes to evaluate on, by group name.
 
@@ -70,7 +70,7 @@ def volume_groups(
         data: Folder, `phantom` for phantoms that no run trains on, or None for the agent's own volumes.
         n_phantoms: Number of phantoms.
         own: Function that reads the agent's own volumes.
-        version: Version of the phantoms. Default: 1.
+        version: Version of the phantoms.
     """
     if data is None:
         split = own()

@@ -68,7 +68,7 @@ def export_policy(tracking: str, run_id: str, folder: Path, *, trust: bool = Fal
     return source.run
 
 
-def register_policy(tracking: str, run_id: str, name: str, *, trust: bool = False) -> str:
+def register_policy(tracking: str, run_id: str, name: str, *, trust: bool) -> str:
     """Register the policy of a tracked run, exporting it from the checkpoint if the run has none with a SHA-256.
 
     Args:
@@ -76,7 +76,6 @@ def register_policy(tracking: str, run_id: str, name: str, *, trust: bool = Fals
         run_id: MLflow run ID, or its first characters.
         name: Name of the registered model; created if it does not exist.
         trust: Whether its configuration may name classes that are not armscan's, if the policy must be exported.
-            Default: False.
 
     Returns:
         The URI of the new version, `models:/NAME/VERSION`.

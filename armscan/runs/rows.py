@@ -158,8 +158,14 @@ def collapse(client: TrackingStore, runs: Sequence[Run]) -> list[RunRow]:
     return list(rows(""))
 
 
-def sort_rows(rows: Sequence[RunRow], sort: str, limit: int | None = None) -> list[RunRow]:
-    """Return rows by one of `SORTS`, the greatest first with - before it; those without a value always come last."""
+def sort_rows(rows: Sequence[RunRow], sort: str, limit: int | None) -> list[RunRow]:
+    """Return rows by one of `SORTS`, the greatest first with - before it; those without a value always come last.
+
+    Args:
+        rows: Rows to sort.
+        sort: Key of `SORTS`, perhaps with - before it.
+        limit: Number of rows to return; None for all.
+    """
     # Read once: a size is a request to the server.
     values = [(getattr(row, SORTS[sort.removeprefix("-")]), row) for row in rows]
     known = [each for each in values if each[0] is not None]

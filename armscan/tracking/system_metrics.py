@@ -21,7 +21,7 @@ class SystemMetrics:
         first: Number of the first measurement.
     """
 
-    def __init__(self, take: Callable[[Mapping[str, float], int], None], *, every_s: float, first: int = 0) -> None:
+    def __init__(self, take: Callable[[Mapping[str, float], int], None], *, every_s: float, first: int) -> None:
         self._take, self._every_s, self._number = take, every_s, first
         self._is_over = threading.Event()
         self._thread = threading.Thread(target=self._work, name="system metrics", daemon=True)

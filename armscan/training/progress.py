@@ -18,12 +18,12 @@ from armscan.utils.console import print_sentence
 from armscan.utils.text import PERCENT, formatted
 
 
-def progress_reporter(label: str | None = None, measured: str = "validation") -> Callback:
+def progress_reporter(label: str | None, measured: str) -> Callback:
     """Return a progress bar on a terminal; elsewhere, or with the label of a job, one line per epoch.
 
     Args:
-        label: Label of the job. Default: None, a single run.
-        measured: Origin of the figures, such as `validation, 48 episodes, deterministic`. Default: `validation`.
+        label: Label of the job; None for a single run.
+        measured: Origin of the figures, such as `validation, 48 episodes, deterministic`.
     """
     return ProgressBar(measured) if label is None and sys.stdout.isatty() else ProgressLines(label, measured)
 
