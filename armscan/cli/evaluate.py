@@ -188,9 +188,8 @@ def _check_options(agent: str | None, data: str | None, tracking_experiment: str
             "own experiment, a video not at all"
         )
     if data not in (None, "phantom") and not Path(str(data)).is_dir():
-        raise InvalidValueError(
-            f"--data is {data!r}, but there is no such folder: it must be a folder of volumes, or phantom"
-        )
+        what = "that is a file" if Path(str(data)).exists() else "there is no such folder"
+        raise InvalidValueError(f"--data is {data!r}, but {what}: it must be a folder of volumes, or phantom")
 
 
 def _check_words(run: Sequence[str], agent: str | None, data: str | None, changes: Mapping[str, Any]) -> None:
