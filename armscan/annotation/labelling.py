@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -12,7 +12,7 @@ from PIL import Image
 
 from armscan.anatomy import SUCCESS_THRESHOLD, FoundPlane, LandmarkReward, PlaneScorer, Tissues, find_optimal_plane
 from armscan.envs.rendering import ReferencePlane, draw_plane, view_of
-from armscan.errors import ArmscanError, InvalidValueError, OptimalPlaneError, listed
+from armscan.errors import ArmscanError, InvalidValueError, MarkupError, OptimalPlaneError, listed
 from armscan.utils.console import print_sentence
 from armscan.utils.files import atomic_write
 from armscan.volumes import (
@@ -20,12 +20,12 @@ from armscan.volumes import (
     LabelVolume,
     ManipulatorAction,
     open_dataset,
-    plane_distance,
     read_markup,
     record_planes,
     write_markup,
 )
 from armscan.volumes.markups import MARKUP_SUFFIX
+from armscan.volumes.plane import shift_into
 
 # Distance in mm and degrees below which two planes are the same: what writing and reading a file rounds.
 SAME = 1e-3
@@ -46,8 +46,7 @@ class LabellingOptions:
         markups: Whether to write a markups file for 3D Slicer beside each picture.
         markup: Markups file with the plane of `volume`, which replaces the search.
         volume: Name of the volume that `markup` is for; it may already have a plane.
-        search: Function that takes the volumes to label by name, and returns one that finds the plane of a volume.
-            Default: None, `find_optimal_plane`.
+        search: Function that finds the plane of a volume. Default: None, `find_optimal_plane`.
     """
 
     data: Path
@@ -58,7 +57,7 @@ class LabellingOptions:
     markups: bool = False
     markup: Path | None = None
     volume: str | None = None
-    search: Callable[[Mapping[str, LabelVolume]], Search] | None = None
+    search: Search | None = None
 
 
 def label(options: LabellingOptions) -> tuple[list[tuple[LabelVolume, FoundPlane]], list[ArmscanError]]:
@@ -72,14 +71,14 @@ def label(options: LabellingOptions) -> tuple[list[tuple[LabelVolume, FoundPlane
     volumes = _wanted(options, dataset)
     if options.markups and options.markup is None:
         _write_known_markups(options, dataset.volumes, set(volumes))
-    find = _search(options, volumes)
+    find = _search(options)
     labelled: list[tuple[LabelVolume, FoundPlane]] = []
     failures: list[ArmscanError] = []
     for number, (name, volume) in enumerate(volumes.items(), 1):
         print(f"{number}/{len(volumes)}  {name}", flush=True)
         try:
             plane = find(volume)
-        # The latter: the clustering rules are none for its spacing.
+        # InvalidValueError: the clustering rules, or the agent, do not suit the volume.
         except (OptimalPlaneError, InvalidValueError) as error:
             failures.append(error)
             continue
@@ -107,13 +106,13 @@ def _wanted(options: LabellingOptions, dataset: Dataset) -> dict[str, LabelVolum
     return {name: volume for name, volume in wanted.items() if volume.optimal_action is None}
 
 
-def _search(options: LabellingOptions, volumes: dict[str, LabelVolume]) -> Search:
-    """Return the function that finds or reads the plane of each of these volumes."""
+def _search(options: LabellingOptions) -> Search:
+    """Return the function that finds or reads the plane of a volume."""
     if options.markup is not None:
         return partial(_drawn, options.markup, options.tissues)
-    if options.search is not None and volumes:
-        return options.search(volumes)
-    return partial(find_optimal_plane, success_threshold=SUCCESS_THRESHOLD, clustering=options.tissues)
+    return options.search or partial(
+        find_optimal_plane, success_threshold=SUCCESS_THRESHOLD, clustering=options.tissues
+    )
 
 
 def _drawn(markup: Path, tissues: Tissues, volume: LabelVolume) -> FoundPlane:
@@ -133,15 +132,23 @@ def _write_known_markups(options: LabellingOptions, volumes: dict[str, LabelVolu
 def _write_markup(folder: Path, volume: LabelVolume, action: ManipulatorAction) -> None:
     """Write a plane as a markups file, unless a person has moved the plane in the file that is there."""
     path = folder / f"{volume.name}{MARKUP_SUFFIX}"
-    if path.exists():
-        stored = read_markup(path, volume)
-        planes = [action] if volume.optimal_action is None else [action, volume.optimal_action]
-        if not any(np.allclose(plane_distance(stored, each, volume.slice_centre_mm), 0, atol=SAME) for each in planes):
-            print_sentence(
-                f"note: {path} holds another plane, and is left as it is: read it back with --markup, or delete it"
-            )
-            return
+    known = [action] if volume.optimal_action is None else [action, volume.optimal_action]
+    if path.exists() and not _holds_one_of(path, volume, known):
+        print_sentence(
+            f"note: {path} holds another plane, or none, and is left as it is: read it back with --markup, or delete it"
+        )
+        return
     write_markup(path, volume, action)
+
+
+def _holds_one_of(path: Path, volume: LabelVolume, planes: Sequence[ManipulatorAction]) -> bool:
+    try:
+        stored = read_markup(path, volume).to_array()
+    # A file that cannot be read may be a person's, too.
+    except MarkupError:
+        return False
+    within = (shift_into(each, volume.size_mm[:2]) or each for each in planes)
+    return any(np.allclose(stored, each.to_array(), rtol=0.0, atol=SAME) for each in within)
 
 
 def _make_folder(folder: Path) -> None:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +15,7 @@ from armscan.cli.options import (
     CommaSeparated,
     clustering_option,
     examples,
+    is_given,
     tracking_option,
     trust_option,
 )
@@ -26,6 +26,7 @@ from armscan.utils.text import counted
 if TYPE_CHECKING:
     from armscan.anatomy import FoundPlane
     from armscan.annotation.labelling import LabellingOptions
+    from armscan.evaluation.unlabelled import AgentSearch
     from armscan.volumes import Dataset, LabelVolume
     from armscan.volumes.volume_report import VolumeReport
 
@@ -96,20 +97,23 @@ def label(
     if pictures is None and (folder / PICTURES).is_symlink():
         # Otherwise the author of the data folder would choose where pictures are written.
         raise InvalidValueError(f"{folder / PICTURES}: is a link: name the folder of the pictures with --pictures")
+    if agent is None and (is_given("tracking") or trust):
+        raise click.UsageError("--tracking and --trust are for --agent")
     from armscan.anatomy import check_tissues
     from armscan.annotation.labelling import LabellingOptions
     from armscan.annotation.labelling import label as label_planes
 
+    search = None if agent is None else _agent_search(agent, tracking, clustering, trust=trust)
     options = LabellingOptions(
         data=folder,
-        tissues=check_tissues(clustering or "pixels"),
+        tissues=check_tissues(clustering or "pixels") if search is None else search.tissues,
         volumes=volumes,
         overwrite=overwrite,
         pictures=pictures or folder / PICTURES,
         markups=markups,
         markup=markup,
         volume=volume,
-        search=None if agent is None else partial(_agent_search, agent, tracking, trust),
+        search=search,
     )
     labelled, failures = label_planes(options)
     if labelled:
@@ -123,13 +127,12 @@ def label(
     return 2 if failures else 0
 
 
-def _agent_search(
-    run: str, tracking: str, trust: bool, volumes: Mapping[str, LabelVolume]
-) -> Callable[[LabelVolume], FoundPlane]:
+def _agent_search(run: str, tracking: str, clustering: str | None, *, trust: bool) -> AgentSearch:
     from armscan.evaluation import agent_of_run
-    from armscan.evaluation.unlabelled import agent_search
+    from armscan.evaluation.unlabelled import AgentSearch
 
-    return agent_search(agent_of_run(tracking, run, {}, trust=trust), dict(volumes))
+    changes = {} if clustering is None else {"clustering": clustering}
+    return AgentSearch(agent_of_run(tracking, run, changes, trust=trust))
 
 
 @data.command(epilog=examples("data explore wrists --volume a.nii.gz"))

@@ -26,8 +26,8 @@ FILE_SUFFIX = "_FILE"
 # USER:PASSWORD@, where the password of a database may contain a slash; or an option such as sslpassword=.
 PASSWORD = re.compile(
     r"""(?<![\w+.-])(?:
-    https?://[^/?#]*:[^/?#]*@
-    | (?!https?:|sqlite|file)[\w+.-]+://[^/?#:]*:[^?#]*@
+    https?://[^/?#,]*:(?:(?!,\s*[\w+.-]+://)[^/?#])*@
+    | (?!https?:|sqlite|file)[\w+.-]+://[^/?#:,]*:(?:(?!,\s*[\w+.-]+://)[^?#])*@
     | (?!sqlite|file)[\w+.-]+://.*[?&]\w*password=.)""",
     re.VERBOSE,
 )

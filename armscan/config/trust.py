@@ -16,7 +16,7 @@ from urllib.parse import urlsplit
 
 from armscan.config.legacy import migrate
 from armscan.config.sources import SWEEP, config_folder, own_folders, sweeps_folder, yaml_files
-from armscan.errors import UntrustedError, listed
+from armscan.errors import UntrustedError
 
 TRUST = "--trust"
 HOW = f"if you trust its author, repeat the command with {TRUST}"
@@ -25,8 +25,9 @@ TARGETS = re.compile(rf"""{TARGET}["']?: *["']?([\w.]+)""")
 SERVER = re.compile(r"(?<![\w+.-])(?!sqlite:)[\w+.-]+://")
 # A path that leads out of a group of the configuration: Hydra composes any YAML file that the choice of a group names.
 OUTSIDE = re.compile(r"\.\.|(?<![\w-])/")
-# Schemes of artifacts whose clients send no password of MLflow's: a path, a folder, object stores.
-WITHOUT_PASSWORD = ("", "file", "s3", "gs", "wasbs", "abfss")
+# Schemes of artifacts whose clients send no password to a server of anybody's: object stores, a path, a folder.
+OBJECT_STORES = ("s3", "gs", "wasbs")
+WITHOUT_PASSWORD = (*OBJECT_STORES, "", "file")
 # Of grids and studies; the configuration of a run names none of their classes.
 GROUPS_OF_COMMANDS = ("hydra", "study")
 PACKAGES_OF_COMMANDS = ("armscan.launch.", "armscan.sweeps.")
@@ -46,7 +47,7 @@ def _classes_in(files: Iterable[Path]) -> set[str]:
 
 
 def stored_config(config: Mapping[str, Any], *, where: str, trust: bool) -> dict[str, Any]:
-    """Return a stored configuration with the keys and classes of this version.
+    """Return a stored configuration with the keys and classes of this version, and the user's own cache.
 
     Args:
         config: Resolved configuration, as it was stored.
@@ -57,9 +58,13 @@ def stored_config(config: Mapping[str, Any], *, where: str, trust: bool) -> dict
         UntrustedError: If it names a class that armscan does not offer, or holds an interpolation.
     """
     config = migrate(config)
-    if not trust and (found := _foreign_part(config, offered_classes())):
+    if trust:
+        return config
+    if found := _foreign_part(config, offered_classes()):
         raise UntrustedError(f"{where}: its configuration {found}; {HOW}")
-    return config
+    data = config.get("data")
+    # Phantoms would be written into any folder; the user's own cache holds the same ones.
+    return config | {"data": {**data, "cache_dir": None}} if isinstance(data, dict) and "cache_dir" in data else config
 
 
 def check_composed(config: Mapping[str, Any], *, where: str) -> None:
@@ -161,15 +166,27 @@ def check_artifact_address(uri: str, store: str) -> None:
         uri: Address of the artifacts of a run, or of an experiment.
         store: Address of the tracking store that names it.
     """
-    at, here = urlsplit(uri), urlsplit(store)
+    scheme, host = _server_of(uri)
+    of_store, own = _server_of(store)
     # Without a server of its own, `mlflow-artifacts:/...` is on the store's.
-    is_here = (at.netloc or here.netloc) == here.netloc and at.scheme in ("mlflow-artifacts", here.scheme)
-    if at.scheme in WITHOUT_PASSWORD or (here.scheme in ("http", "https") and is_here):
-        return
-    raise UntrustedError(
-        f"the artifacts are in {uri}, but in a store at {store} they must be {listed(WITHOUT_PASSWORD[1:])}, or on its "
-        "own server: another would be sent this user's password"
-    )
+    is_here = of_store in ("http", "https") and scheme in ("mlflow-artifacts", of_store) and host in ("", own)
+    if scheme not in WITHOUT_PASSWORD and not is_here:
+        raise UntrustedError(
+            f"the artifacts are in {uri}, but those of the store {store} must be in a folder, in an object store "
+            f"({', '.join(OBJECT_STORES)}), or on its own server: another would be sent this user's password"
+        )
+
+
+def _server_of(uri: str) -> tuple[str, str]:
+    """Return the scheme of an address, and its server: host and port, without a user; `unknown` if it has no form."""
+    try:
+        parts = urlsplit(uri)
+        port = parts.port
+    except ValueError:
+        return "unknown", "unknown"
+    if not parts.hostname:
+        return parts.scheme, ""
+    return parts.scheme, f"{parts.hostname}:{port or {'https': 443}.get(parts.scheme, 80)}"
 
 
 def _leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:

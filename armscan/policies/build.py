@@ -60,7 +60,7 @@ def save_policy(
         tracked: Run of the agent.
         folder: Folder of the run.
         tell: Function that prints a sentence.
-        slice_px: Smallest slice of the run's volumes, which images are cropped to by default.
+        slice_px: Largest shape that fits into the slices of the run's volumes, which images are cropped to by default.
     """
     config = yaml.safe_load((folder / CONFIG_FILE).read_bytes())
     # Runs of earlier versions do not have the key.

@@ -114,6 +114,7 @@ class TrackedRun:
             TrackingError: If its tag `resumed` is not a whole number.
         """
         run_id = run.info.run_id
+        store.check_artifacts_of(run)
         if not (resumed := run.data.tags.get("resumed", "0")).isdecimal():
             raise TrackingError(f"run {run_id}: its tag resumed is {resumed[:50]!r}, but it must be a whole number")
         n_resumed = int(resumed[:MAX_DIGITS]) + 1

@@ -222,6 +222,7 @@ def _experiment_in(store: TrackingStore, name: str, artifacts: str | None) -> st
                 raise
             found = store.get_experiment_by_name(name)
         else:
+            check_artifacts(store, experiment_id)
             _keep_view(store, experiment_id, {})
             return experiment_id
     if found.lifecycle_stage != "active":

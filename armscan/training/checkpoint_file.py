@@ -10,10 +10,13 @@ import io
 import re
 import zipfile
 from pathlib import Path
-from typing import Any, BinaryIO, cast
+from typing import TYPE_CHECKING, Any, BinaryIO, cast
 
 from armscan.errors import CheckpointError
 from armscan.utils.files import atomic_write
+
+if TYPE_CHECKING:
+    import torch
 
 FORMAT = 1
 MAGIC = b"armscan checkpoint "
@@ -90,15 +93,22 @@ def load_weights(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         raise CheckpointError(f"{path}: holds a full training state, as last.pt does, not the best weights")
     for name, weight in weights.items():
         if not isinstance(name, str):
-            raise CheckpointError(f"{path}: names weights {name!r}, but names must be strings")
+            raise CheckpointError(f"{path}: names weights by an {type(name).__name__}, but names must be strings")
         if isinstance(weight, torch.Tensor):
-            # Others would fail, or take memory that the file does not.
-            is_dense = weight.layout == torch.strided and weight.device.type == "cpu" and not weight.is_quantized
-            if not is_dense or weight.nbytes > weight.untyped_storage().nbytes():
+            if not _is_dense(weight):
                 raise CheckpointError(f"{path}: holds weights that are no dense tensor of its own, in {name}")
             if not torch.isfinite(weight).all():
                 raise CheckpointError(f"{path}: holds weights that are not finite, in {name}")
     return weights, facts
+
+
+def _is_dense(weight: torch.Tensor) -> bool:
+    """Return whether a tensor holds usual numbers, and takes no memory that its file does not."""
+    import torch
+
+    is_usual = weight.dtype in (torch.float32, torch.float64, torch.float16, torch.bfloat16, torch.int64)
+    is_strided = weight.layout == torch.strided and weight.device.type == "cpu" and not weight.is_nested
+    return is_usual and is_strided and weight.nbytes <= weight.untyped_storage().nbytes()
 
 
 def _header(digest: str) -> bytes:
@@ -128,9 +138,13 @@ def _check_uncompressed(contents: BinaryIO, path: Path) -> None:
     """Raise `CheckpointError` if an archive takes more memory than space in the file, as torch never writes it."""
     size = contents.seek(0, io.SEEK_END)
     with zipfile.ZipFile(contents) as archive:
-        n_bytes = sum(each.file_size for each in archive.infolist())
-    if n_bytes > size:
-        raise CheckpointError(f"{path}: is not a checkpoint: {size} bytes of the file become {n_bytes}")
+        entries, comment = archive.infolist(), archive.comment
+    # torch reads the directory that the end of the archive points to, and `zipfile` the one before its end: with files
+    # from the first byte on and no comment, they are the same.
+    is_plain = not comment and min((each.header_offset for each in entries), default=1) == 0
+    n_bytes = sum(each.file_size for each in entries)
+    if n_bytes > size or not is_plain:
+        raise CheckpointError(f"{path}: is not a checkpoint: its archive of {size} bytes is not as torch writes it")
     contents.seek(0)
 
 

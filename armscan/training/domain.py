@@ -29,7 +29,7 @@ class TrainingDomain:
 
     Args:
         observed: Shape of each part of an observation; a single vector has the name `vector`.
-        slice_px: Smallest slice (across, depth) in pixels; images are cropped to it.
+        slice_px: Largest shape (across, depth) in pixels that fits into all slices; images are cropped to it.
         pixel_mm: Smallest and largest pixel size, (across, depth) in mm.
         size_mm: Smallest and largest size of a volume, (across, along) in mm, which is the range of a normalised
             translation.
@@ -46,7 +46,8 @@ class TrainingDomain:
 
         Args:
             env: Environment with the volumes.
-            slice_px: Crop of its images if the configuration gives none. Default: the smallest slice.
+            slice_px: Crop of its images if the configuration gives none. Default: the largest that fits into all
+                slices.
         """
         space, volumes = env.observation_space, env.get_wrapper_attr("volumes").values()
         parts = space.spaces if isinstance(space, spaces.Dict) else {"vector": space}
@@ -110,13 +111,14 @@ def smallest_slice(volumes: Iterable[LabelVolume]) -> tuple[int, int]:
 def with_crops(rules: Any, trained: tuple[int, int], here: tuple[int, int]) -> Any:
     """Return the configuration of an observation with images cropped as in an agent's training.
 
-    Without a crop in the configuration, images are cropped to the smallest slice of the environment's volumes, which
-    differs between data sets. Images that are resized to one shape keep that rule if slices are smaller.
+    Without a crop in the configuration, images are cropped to the largest shape that fits into the slices of the
+    environment's volumes, which differs between data sets. Images that are resized to one shape keep that rule if
+    slices are smaller.
 
     Args:
         rules: Configuration as plain dictionaries and lists, or the name of an observation.
-        trained: Smallest slice of the training volumes, (across, depth) in pixels.
-        here: Smallest slice of the volumes that the agent is applied to, (across, depth) in pixels.
+        trained: Largest shape that fits into the slices of the training volumes, (across, depth) in pixels.
+        here: The same of the volumes that the agent is applied to.
 
     Raises:
         InvalidValueError: If images would have to be larger than the slices.

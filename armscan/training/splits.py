@@ -82,14 +82,14 @@ class Split:
     @property
     def names(self) -> str | None:
         """The names of the volumes in each part, phantoms only counted; None if all are phantoms."""
+        if all(PHANTOM_NAME.fullmatch(name) for volumes in self.parts.values() for name in volumes):
+            return None
         of_parts = []
         for part, volumes in self.parts.items():
             own = [name for name in volumes if not PHANTOM_NAME.fullmatch(name)]
             phantoms = [counted(len(volumes) - len(own), "phantom")] if len(own) < len(volumes) else []
-            of_parts.append((part, [few(own, N_NAMED)] * bool(own) + phantoms, bool(own)))
-        if not any(has_own for *_, has_own in of_parts):
-            return None
-        return "; ".join(f"{part}: {' and '.join(words)}" for part, words, _ in of_parts)
+            of_parts.append(f"{part}: {' and '.join([few(own, N_NAMED)] * bool(own) + phantoms)}")
+        return "; ".join(of_parts)
 
     def fingerprints(self) -> Fingerprints:
         """Return a checksum of each volume's contents, by part and name."""

@@ -1,6 +1,7 @@
 """The command that labels a folder of volumes."""
 
 import shutil
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -73,7 +74,7 @@ def test_label_takes_the_planes_that_an_agent_finds(bare, names, database, tmp_p
     assert planes(bare)[names[0]] is None
     assert planes(bare)[names[1]] is not None
     assert "planes written into the manifest" in capsys.readouterr().out
-    assert "and its environment holds rz, rx or tx at the labelled plane" in refused(
+    assert "and its environment holds rz and rx and tx at the labelled plane" in refused(
         [str(bare), f"--agent={tracked(tmp_path)}", store], capsys
     )
 
@@ -134,7 +135,19 @@ def test_label_keeps_a_markups_file_with_a_plane_that_a_person_has_moved(bare, n
         assert main(["data", "label", str(bare), "--markups", *more]) == 0
         np.testing.assert_allclose(read_markup(file, dataset[names[0]]).to_array(), moved.to_array(), atol=1e-6)
         said = " ".join(capsys.readouterr().out.split())
-        assert said.count("holds another plane, and is left as it is") == 1
+        assert said.count("holds another plane, or none, and is left as it is") == 1
+    # Moved across, within itself.
+    across = replace(moved, translation=(4.0, 20.0))
+    write_markup(file, dataset[names[0]], across)
+    armscan.volumes.record_planes(bare, {names[0]: (moved, -0.5)})
+    assert main(["data", "label", str(bare), "--markups"]) == 0
+    np.testing.assert_allclose(read_markup(file, dataset[names[0]]).to_array(), across.to_array(), atol=1e-6)
+    damaged = bare / "labelling" / f"{names[1]}.mrk.json"
+    damaged.write_text("{")
+    assert main(["data", "label", str(bare), "--markups"]) == 0
+    assert damaged.read_text() == "{"
+    damaged.unlink()
+    capsys.readouterr()
     # Once it is read back, it is the manifest's plane.
     assert main(["data", "label", str(bare), f"--volume={names[0]}", f"--markup={file}"]) == 0
     assert main(["data", "label", str(bare), "--markups"]) == 0
@@ -156,6 +169,7 @@ def test_label_keeps_a_markups_file_with_a_plane_that_a_person_has_moved(bare, n
         (["x", "--volume=y"], "--markup and --volume must be given together"),
         (["x", "--markup=y", "--volume=z", "--overwrite"], "--overwrite is for a search"),
         (["x", "--markup=y", "--volume=z", "--agent=a"], "--agent is for a search"),
+        (["x", "--trust"], "--tracking and --trust are for --agent"),
         (["x", "--markup=y", "--volume=z", "--volumes=z"], "--volumes is for a search"),
         (["007[${x}"], "007[${x}: the folder of volumes does not exist"),
         (["/no/such/folder"], "/no/such/folder: the folder of volumes does not exist"),

@@ -190,6 +190,8 @@ def test_server_that_a_run_names_for_its_artifacts_is_sent_nothing(armscan, tmp_
         code, _, errors = answered(armscan, name, run_id)
         assert (code, f"the artifacts are in {uri}" in errors) == (2, True)
     assert "they cannot be read" in armscan("runs", "show", run_id)[1]
+    with pytest.raises(UntrustedError, match="the artifacts are in"):
+        resume([f"resume={run_id}"], list)
     outbox = Outbox.begin(tmp_path / "theirs", Address(run_id, f"sqlite:///{tmp_path}/mlruns.db"))
     (tmp_path / "theirs/x.txt").touch()
     outbox.add(file=["x.txt", None])

@@ -86,7 +86,8 @@ def test_words_with_a_password_are_refused_and_others_are_not():
     ):
         with pytest.raises(InvalidValueError, match=r"^tracking.uri has a password in its address"):
             check_words([f"tracking.uri={value}"])
-    check_words(["tracking.uri=http://host:5000,http://host:5001/a@b"])
+    check_words(["tracking.uri=http://host:5000,http://me@host:5001/a@b"])
+    check_words(["tracking.uri=postgresql://h:5432/a,postgresql://me@h:5432/b"])
 
 
 def test_service_is_where_the_environment_says(monkeypatch):

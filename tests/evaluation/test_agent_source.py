@@ -84,6 +84,10 @@ def with_nan(weights, facts):
     return weights | {name: weights[name] * float("nan")}, facts
 
 
+def with_weight(weight, weights, facts):
+    return weights | {"w": weight}, facts
+
+
 def with_n_env_steps(n_env_steps, weights, facts):
     return weights, facts | {"n_env_steps": n_env_steps}
 
@@ -94,10 +98,18 @@ def test_checkpoint_that_is_larger_in_memory_than_on_disk_is_refused(evaluate, t
     with zipfile.ZipFile(contents) as archive, zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as compressed:
         for name in archive.namelist():
             compressed.writestr(name, archive.read(name) + b"0" * 10**6)
-    header = f"armscan checkpoint 1 {sha256(packed.getvalue())}\n".encode()
-    (tmp_path / "best.pt").write_bytes(header + packed.getvalue())
-    store_of(tmp_path).log_artifact(run_id, str(tmp_path / "best.pt"))
-    assert_refused(evaluate(run_id), f"run {run_id}: best.pt: is not a checkpoint: {len(packed.getvalue())} bytes of")
+
+    # And one whose end, which torch believes, could point to another directory than the one that Python reads.
+    shifted = io.BytesIO((tmp_path / "best.pt").read_bytes().partition(b"\n")[2])
+    with zipfile.ZipFile(shifted, "a") as archive:
+        archive.comment = b"moved"
+    for contents in (packed, shifted):
+        header = f"armscan checkpoint 1 {sha256(contents.getvalue())}\n".encode()
+        (tmp_path / "changed").mkdir(exist_ok=True)
+        (tmp_path / "changed/best.pt").write_bytes(header + contents.getvalue())
+        store_of(tmp_path).log_artifact(run_id, str(tmp_path / "changed/best.pt"))
+        line = f"run {run_id}: best.pt: is not a checkpoint: its archive of {len(contents.getvalue())} bytes"
+        assert_refused(evaluate(run_id), line)
 
 
 @pytest.mark.parametrize(
@@ -117,9 +129,13 @@ def test_checkpoint_that_is_larger_in_memory_than_on_disk_is_refused(evaluate, t
         (lambda weights, facts: (weights | {"w": torch.zeros(1).expand(10**12)}, facts), f"best.pt: {NOT_DENSE} in w"),
         (lambda weights, facts: (weights | {"w": torch.zeros(3).to_sparse()}, facts), f"best.pt: {NOT_DENSE} in w"),
         (lambda weights, facts: (weights | {"w": torch.zeros(3, device="meta")}, facts), f"best.pt: {NOT_DENSE} in w"),
-        (lambda weights, facts: (weights | {3: 1}, facts), "best.pt: names weights 3, but"),
+        (lambda weights, facts: (weights | {3: 1}, facts), "best.pt: names weights by an int, but"),
         *(
-            (partial(with_n_env_steps, n), f"its checkpoint has n_env_steps = {n!r}, but it must be a whole number")
+            (partial(with_weight, torch.zeros(4, dtype=torch.uint8).view(dtype)), f"best.pt: {NOT_DENSE} in w")
+            for dtype in (torch.float8_e4m3fn, torch.bits8)
+        ),
+        *(
+            (partial(with_n_env_steps, n), "the n_env_steps of its checkpoint must be a whole number from 0 to")
             for n in ("abc", float("inf"), -5, 2**70)
         ),
     ],

@@ -2,12 +2,13 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
-from armscan.errors import InvalidValueError
+from armscan.errors import InvalidValueError, OptimalPlaneError
 from armscan.evaluation import agent_of_run
 from armscan.evaluation.runner import FIRST_SEED, prepare_on_volumes
-from armscan.evaluation.unlabelled import agent_search
+from armscan.evaluation.unlabelled import AgentSearch
 from armscan.training.episodes import play
 from armscan.volumes import LabelVolume
 from tests.support.tracked_runs import tracked
@@ -29,7 +30,7 @@ def test_agent_finds_the_plane_of_its_episode_without_knowing_the_labelled_one(d
     source = source_of(tmp_path, *overrides)
     volume = next(iter(dataset.values()))
     unlabelled = replace(volume, optimal_action=None)
-    found = agent_search(source, {volume.name: unlabelled})(unlabelled)
+    found = AgentSearch(source)(unlabelled)
     source.config.env.transform = None
     env = prepare_on_volumes(source, {"volumes": {volume.name: volume}}, own=pytest.fail)
     result = play(env.agent, env.envs["volumes"], volume.name, FIRST_SEED)
@@ -40,14 +41,21 @@ def test_agent_finds_the_plane_of_its_episode_without_knowing_the_labelled_one(d
 def test_agent_whose_environment_holds_components_is_refused(database, tmp_path, dataset):
     source = source_of(tmp_path, "projection=zy")
     with pytest.raises(
-        InvalidValueError, match=r"moves rz or ty only, and its environment holds rx or tx at the label"
+        InvalidValueError, match=r"moves rz and ty only, and its environment holds rx and tx at the label"
     ):
-        agent_search(source, {})
+        AgentSearch(source)
 
 
 def test_plane_is_found_in_a_volume_whose_middle_shows_nothing(database, tmp_path, dataset):
     source, volume = source_of(tmp_path, "projection=full"), next(iter(dataset.values()))
-    labels = volume.labels.copy()
-    labels[:, labels.shape[1] // 4 :] = 0
-    low = LabelVolume(labels, volume.spacing, "low")
-    assert -1.0 <= agent_search(source, {"low": low})(low).score <= 0.0
+    search = AgentSearch(source)
+
+    def only(first, last):
+        labels = np.zeros_like(volume.labels)
+        kept = slice(*(int(part * labels.shape[1]) for part in (first, last)))
+        labels[:, kept] = volume.labels[:, kept]
+        return LabelVolume(labels, volume.spacing, "part")
+
+    search(only(0.65, 0.72))
+    with pytest.raises(OptimalPlaneError, match=r"^part: the agent's environment sees nothing at 7 places of the arm"):
+        search(only(0.62, 0.68))
