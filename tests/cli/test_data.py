@@ -36,7 +36,11 @@ def test_data_command_tells_what_each_volume_holds(write_labelmap, tmp_path, mon
         assert part in printed
 
 
-def test_data_command_notes_a_palm_at_low_z_and_a_plane_that_misses_the_volume(data_folder, tmp_path, capsys):
+def test_data_command_notes_a_palm_at_low_z_and_a_plane_that_misses_the_volume(
+    data_folder, tmp_path, monkeypatch, capsys
+):
+    # Set in the workers of pytest-xdist.
+    monkeypatch.delenv("COLUMNS", raising=False)
     volume = next(data_folder.glob("*.nii.gz"))
     shutil.copyfile(volume, tmp_path / volume.name)
     manifest = tmp_path / "manifest.yaml"
