@@ -19,7 +19,7 @@ from armscan.cli.options import (
     tracking_option,
     trust_option,
 )
-from armscan.errors import InvalidValueError, print_error
+from armscan.errors import InvalidValueError, few, print_error
 from armscan.utils.console import WHOLE_CHARS, print_sentence, print_table, wide_console
 from armscan.utils.text import counted
 
@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 # Folder of pictures within the folder of the data.
 PICTURES = "labelling"
+# Names of files that are listed.
+N_LISTED = 8
 
 
 @click.group()
@@ -160,6 +162,8 @@ def explore(folder: Path | None, volume: str | None, clustering: str | None) -> 
 
 def _print_dataset(dataset: Dataset, folder: Path) -> None:
     """Print a table for each volume, and the excluded volumes."""
+    from armscan.volumes.manifest import MANIFEST_NAMES
+
     # Lines of a file or a pipe are never wrapped.
     console = wide_console(WHOLE_CHARS)
     for name, report in dataset.reports.items():
@@ -170,6 +174,9 @@ def _print_dataset(dataset: Dataset, folder: Path) -> None:
         console.print(_tissue_table(report))
         for note in report.notes:
             console.print(Text(f"note: {note}"))
+    read = {*dataset.reports, *dataset.excluded, *MANIFEST_NAMES, PICTURES}
+    if others := sorted(each.name for each in folder.iterdir() if each.name not in read and each.name[0] != "."):
+        console.print(Text(f"not read: {few(others, N_LISTED)}"))
     for name, reason in dataset.excluded.items():
         console.print(Text(f"{name}: excluded" + ("" if reason == "True" else f" ({reason})")))
     n_volumes, n_subjects = len(dataset.reports), len(set(dataset.subjects.values()))

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from armscan.errors import ManifestError, few, listed
+from armscan.errors import ManifestError, VolumeError, few, listed
 from armscan.utils.validation import check_choice, check_path
 from armscan.volumes.manifest import (
     MANIFEST_NAMES,
@@ -86,13 +86,17 @@ def open_dataset(path: str | Path, *, require_manifest: bool = True) -> Dataset:
     used = {name: entry for name, entry in entries.items() if not entry.exclude}
     if not used:
         raise ManifestError(f"{found}: excludes every volume of the folder")
-    volumes, stored = {}, {}
+    volumes, stored, errors = {}, {}, {}
     for name, entry in used.items():
-        volumes[name], stored[name] = read_cached(
-            files[name],
-            ReadingOptions(crop_mm=entry.crop_mm, **{key: manifest.setting(entry, key) for key in SHARED_KEYS}),
-            optimal_action=entry.plane,
-        )
+        options = ReadingOptions(crop_mm=entry.crop_mm, **{key: manifest.setting(entry, key) for key in SHARED_KEYS})
+        try:
+            volumes[name], stored[name] = read_cached(files[name], options, optimal_action=entry.plane)
+        except VolumeError as error:
+            errors[name] = error
+    if errors:
+        (_, first), *others = errors.items()
+        more = f"; these cannot be read either: {few(name for name, _ in others)}" if others else ""
+        raise VolumeError(f"{first}{more}") from first
     if manifest.spacing == "finest":
         spacing = finest_spacing(volumes.values())
         volumes = {name: resample_cached(volume, spacing) for name, volume in volumes.items()}

@@ -40,6 +40,8 @@ OTHER_LENGTHS |= {f"{name}s" for name in OTHER_LENGTHS} | {"m", "cm", "um", "\u0
 OTHER_LENGTHS |= {"micron", "microns", "in", "inch", "inches"}
 # Spaces of NRRD that are not the patient's; SimpleITK reads them as left-posterior-superior.
 NO_ANATOMY = ("scanner-xyz", "sxyz", "3d-right-handed", "3dr", "3d-left-handed", "3dl")
+# Those that 3D Slicer writes, and slicerio reads.
+SEGMENTATION_SPACES = ("left-posterior-superior", "right-anterior-superior")
 NRRD_ENCODINGS = {"raw": None, "gzip": GZIP, "gz": GZIP}
 
 
@@ -61,6 +63,8 @@ def check_nrrd(path: Path, needed: Sequence[str] = ()) -> None:
     for name in ("type", "dimension", "sizes", "encoding", *needed):
         if name not in fields:
             raise VolumeError(f"{path}: the file gives no {name}, but it must")
+    if needed and fields["space"] not in SEGMENTATION_SPACES:
+        raise VolumeError(f"{path}: space is {fields['space']}, but a segmentation's is {listed(SEGMENTATION_SPACES)}")
     voxel_bytes = NRRD_TYPES.get(re.sub("^(un)?signed |_t$", "", fields["type"]))
     sizes = [_whole(path, "sizes", word) for word in fields["sizes"].split()]
     if voxel_bytes is None or fields["dimension"] != str(len(sizes)):

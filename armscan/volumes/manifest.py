@@ -51,7 +51,9 @@ def volume_files(folder: Path) -> dict[str, Path]:
     if capital := [file for file in found if not file.name.endswith(tuple(CHECKS))]:
         raise VolumeError(f"{capital[0]}: ends in capitals, but the end of a volume's name must be {listed(CHECKS)}")
     if not found:
-        raise VolumeError(f"{folder}: the folder holds no volume (files ending in {listed(CHECKS)})")
+        raise VolumeError(
+            f"{folder}: the folder holds no volume (files ending in {listed(CHECKS)}); folders below it are not read"
+        )
     return {file.name: file for file in found}
 
 

@@ -54,14 +54,23 @@ def test_data_command_notes_a_palm_at_low_z_and_a_plane_that_misses_the_volume(
     assert "note:" not in capsys.readouterr().out
 
 
-def test_data_command_needs_no_manifest(write_labelmap, tmp_path, capsys):
+def test_data_command_needs_no_manifest_and_lists_what_it_does_not_read(write_labelmap, tmp_path, capsys):
     write_labelmap("a.nrrd")
+    for name in ("manifst.yaml", "b.nhdr", ".hidden"):
+        (tmp_path / name).touch()
     assert main(["data", "inspect", str(tmp_path)]) == 0
-    assert "a.nrrd: subject a.nrrd, no labelled plane" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "a.nrrd: subject a.nrrd, no labelled plane" in printed
+    assert "not read: b.nhdr, manifst.yaml" in printed
 
 
-def test_data_command_answers_a_mistake_in_one_line(tmp_path, capsys):
+def test_data_command_answers_a_mistake_in_one_line(write_labelmap, tmp_path, capsys):
     assert main(["data", "inspect", str(tmp_path / "nowhere")]) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("error: ")
-    assert len(error.splitlines()) == 1
+    write_labelmap("a.nrrd")
+    for name in ("b.nrrd", "c.nrrd"):
+        (tmp_path / name).write_text("damaged")
+    assert main(["data", "inspect", str(tmp_path)]) == 2
+    of_none, of_two = capsys.readouterr().err.splitlines()
+    assert of_none.startswith("error: ")
+    assert of_two.startswith(f"error: {tmp_path}/b.nrrd: ")
+    assert of_two.endswith("; these cannot be read either: c.nrrd")

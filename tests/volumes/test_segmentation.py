@@ -136,6 +136,7 @@ def test_segmentation_of_an_older_slicer_has_a_layer_a_segment(tmp_path, tiny_vo
         ([], {}, "names no segment"),
         ([("bones", 0, 1)], {"without": ["space directions"]}, "gives no spacing"),
         ([("bones", 0, 1)], {"space": "scanner-xyz"}, "space is scanner-xyz, which does not say"),
+        ([("bones", 0, 1)], {"space": "LPS"}, "space is LPS, but a segmentation's is left-posterior-superior or right"),
         ([("bones", 0, 1)], {"without": ["space"]}, "gives no space"),
         ([("bones", 0, 1)], {"without": ["space origin"]}, "gives no space origin"),
         (
