@@ -106,7 +106,10 @@ def _is_dense(weight: torch.Tensor) -> bool:
     """Return whether a tensor holds usual numbers, and takes no memory that its file does not."""
     import torch
 
-    is_usual = weight.dtype in (torch.float32, torch.float64, torch.float16, torch.bfloat16, torch.int64)
+    floats = torch.float16, torch.bfloat16, torch.float32, torch.float64
+    # Such as masks and counts in the networks of users.
+    others = torch.bool, torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64
+    is_usual = weight.dtype in (*floats, *others)
     is_strided = weight.layout == torch.strided and weight.device.type == "cpu" and not weight.is_nested
     return is_usual and is_strided and weight.nbytes <= weight.untyped_storage().nbytes()
 
