@@ -26,7 +26,7 @@ from armscan.utils.text import counted
 if TYPE_CHECKING:
     from armscan.anatomy import FoundPlane
     from armscan.annotation.labelling import LabellingOptions
-    from armscan.evaluation.unlabelled import AgentSearch
+    from armscan.evaluation.agent_search import AgentSearch
     from armscan.volumes import Dataset, LabelVolume
     from armscan.volumes.volume_report import VolumeReport
 
@@ -131,7 +131,7 @@ def label(
 
 def _agent_search(run: str, tracking: str, clustering: str | None, *, trust: bool) -> AgentSearch:
     from armscan.evaluation import agent_of_run
-    from armscan.evaluation.unlabelled import AgentSearch
+    from armscan.evaluation.agent_search import AgentSearch
 
     changes = {} if clustering is None else {"clustering": clustering}
     return AgentSearch(agent_of_run(tracking, run, changes, trust=trust))

@@ -62,7 +62,7 @@ class VolumeReport:
 
     @property
     def notes(self) -> list[str]:
-        """What suggests that the axes are not those of phantoms, one sentence each."""
+        """Notes on axes that may differ from those of phantoms, one sentence each."""
         notes, size_mm = [], self.volume.size_mm
         if size_mm[1] < max(size_mm):
             sizes = " x ".join(f"{mm:.0f}" for mm in size_mm)

@@ -43,7 +43,7 @@ class Rule:
 
     @property
     def further(self) -> str:
-        """What distinguishes it apart from sampler and pruner, to be added to a name."""
+        """Suffix of its name after sampler and pruner, such as `, 2 seeds`; empty for the default."""
         return (f", {self.n_seeds} seeds" if self.n_seeds > 1 else "") + (", presets" if self.has_presets else "")
 
 

@@ -59,10 +59,10 @@ def test_verdict_leaves_out_figures_that_some_seeds_lack():
 
 
 def test_verdict_leaves_the_draws_of_others_alone():
-    before = np.random.get_state()[1:3]  # noqa: NPY002 - the state that libraries share
+    before = np.random.get_bit_generator().state
     (result,) = final_results([judged(0, figures_of([float(seed), 3.0])) for seed in range(3)])
     assert result.figures.n_seeds == 3
-    np.testing.assert_equal(np.random.get_state()[1:3], before)  # noqa: NPY002
+    np.testing.assert_equal(np.random.get_bit_generator().state, before)
 
 
 def test_verdict_on_one_volume_has_the_interval_of_student():

@@ -7,8 +7,8 @@ import pytest
 
 from armscan.errors import InvalidValueError, OptimalPlaneError
 from armscan.evaluation import agent_of_run
+from armscan.evaluation.agent_search import AgentSearch
 from armscan.evaluation.runner import FIRST_SEED, prepare_on_volumes
-from armscan.evaluation.unlabelled import AgentSearch
 from armscan.training.episodes import play
 from armscan.volumes import LabelVolume
 from tests.support.tracked_runs import tracked
