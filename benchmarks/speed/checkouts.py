@@ -12,7 +12,7 @@ import resource
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -65,10 +65,15 @@ def start(script: str, checkout: Path) -> subprocess.Popen[str]:
 
 def ask(process: subprocess.Popen[str], case: str) -> Any:
     """Return what a process measures for a case."""
-    assert process.stdin is not None
-    assert process.stdout is not None
-    print(json.dumps(case), file=process.stdin, flush=True)
-    return json.loads(process.stdout.readline())
+    return ask_all([process], case)[0]
+
+
+def ask_all(processes: Sequence[subprocess.Popen[str]], case: str) -> list[Any]:
+    """Return what each process measures for a case, all at the same time."""
+    for process in processes:
+        assert process.stdin is not None
+        print(json.dumps(case), file=process.stdin, flush=True)
+    return [json.loads(process.stdout.readline()) for process in processes if process.stdout]
 
 
 def serve(measure: Callable[[str], Any]) -> None:

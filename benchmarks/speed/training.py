@@ -28,9 +28,10 @@ import sys, time
 import armscan.experiment.runner as runner
 train = runner.train
 def timed(*arguments, **options):
-    start_s = time.process_time()
+    processor_s, start_s = time.process_time(), time.perf_counter()
     result = train(*arguments, **options)
-    print("trained", time.process_time() - start_s, result.reports[-1].n_env_steps)
+    used_s = time.process_time() - processor_s, time.perf_counter() - start_s
+    print("trained", *used_s, result.reports[-1].n_env_steps)
     return result
 runner.train = timed
 sys.argv = ["armscan", *sys.argv[1:]]
@@ -40,12 +41,13 @@ main()
 
 
 class Run(NamedTuple):
-    """Processor seconds of a run's training, processor and wall seconds of all of it, and steps of the training."""
+    """Processor and wall seconds of a run, and of its training alone; environment steps of the training."""
 
     training_s: float
     processor_s: float
     wall_s: float
     n_env_steps: int
+    training_wall_s: float
 
 
 def run(checkout: Path, *words: str) -> Run:
@@ -53,8 +55,8 @@ def run(checkout: Path, *words: str) -> Run:
     with tempfile.TemporaryDirectory() as folder:
         said, processor_s, wall_s = run_timed(checkout, folder, "-c", PROGRAM, *words)
     (line,) = (line for line in said.splitlines() if line.startswith("trained "))
-    _, seconds, n_steps = line.split()
-    return Run(float(seconds), processor_s, wall_s, int(n_steps))
+    _, seconds, training_wall_s, n_steps = line.split()
+    return Run(float(seconds), processor_s, wall_s, int(n_steps), float(training_wall_s))
 
 
 def main() -> None:
