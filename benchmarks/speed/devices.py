@@ -42,9 +42,8 @@ def main() -> None:
     devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
     for device in devices:
         run(REPOSITORY, *SHORT, f"device={device}")
-    print_head(
-        "agent", *(f"{device}, s" for device in devices), *(["cpu / cuda: median, least, most"] * len(devices[1:]))
-    )
+    ratio = ["cpu / cuda: median, least, most"] if devices[1:] else []
+    print_head("agent", *(f"{device}, s" for device in devices), *ratio)
     for case, words in CASES.items():
         if not given.cases or case.startswith(tuple(given.cases)):
             rounds = [
