@@ -32,8 +32,8 @@ class BaseLearner(ABC):
 
     @property
     def update_note(self) -> str | None:
-        """See `Learner.update_note`."""
-        return None
+        """Return the device, unless it is the CPU."""
+        return None if self._device == "cpu" else f"on {self._device}"
 
     def weights(self) -> dict[str, Any]:
         """Return the network's weights and buffers."""

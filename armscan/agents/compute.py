@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+from armscan.agents.convolutions import images_of
 from armscan.errors import InvalidValueError
 from armscan.utils.validation import check_bool, check_choice
 
 if TYPE_CHECKING:
+    from gymnasium import spaces
     from torch import nn
 
 DEVICES = ("auto", "cpu", "cuda")
@@ -21,7 +23,7 @@ class Compute:
     """Device and precision of tensors, and compilation of networks.
 
     Args:
-        device: Device of the tensors: `cpu`, `cuda`, or `auto` for `cuda` if there is one.
+        device: Device of the tensors: `cpu`, `cuda`, or `auto` for `cuda` if there is one; see `for_space` too.
         precision: Precision of the products: `float32`, or `bfloat16` for mixed precision (products in 16 bits, sums
             and weights in 32).
         compile: Whether to compile networks with `torch.compile`, which takes a minute and requires a C++ compiler.
@@ -45,6 +47,14 @@ class Compute:
     def torch_device(self) -> str:
         """The device that tensors are on: `cpu` or `cuda`."""
         return "cuda" if self.device == "cuda" or (self.device == "auto" and _has_cuda()) else "cpu"
+
+    def for_space(self, space: spaces.Space[Any]) -> Compute:
+        """Return how an agent of these observations computes: without images, `auto` is the CPU, which is faster then.
+
+        Args:
+            space: Observation space of one environment.
+        """
+        return self if self.device != "auto" or images_of(space) else replace(self, device="cpu")
 
     @property
     def is_float32_on_cpu(self) -> bool:

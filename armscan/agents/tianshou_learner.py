@@ -98,11 +98,12 @@ class TianshouLearner(BaseLearner):
 
     @property
     def update_note(self) -> str:
-        """Return how gradient steps are computed: `compiled`, or `Tianshou`, with the reason if there is one."""
+        """Return how gradient steps are computed: `compiled`, or `Tianshou`, with a GPU's name and the reason if any."""
+        tianshou = " ".join(filter(None, ["Tianshou", super().update_note]))
         if not isinstance(self._algorithm, CompiledSAC):
-            return "Tianshou"
+            return tianshou
         reason = self._algorithm.fallback_reason
-        return "compiled" if reason is None else f"Tianshou, because {reason}"
+        return "compiled" if reason is None else f"{tianshou}, because {reason}"
 
     @property
     def validation_note(self) -> str:

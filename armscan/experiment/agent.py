@@ -55,7 +55,7 @@ def make_agent(
         action_names=env.get_wrapper_attr("action_names"),
         total_env_steps=total_env_steps,
         seed=seed,
-        compute=build_section(config, "compute", Compute),
+        compute=build_section(config, "compute", Compute).for_space(env.observation_space),
         n_steps=env.get_wrapper_attr("rules").n_steps,
         make_validation_envs=None if validation is None else _vector_envs(env_factory.undeformed(), validation),
     )

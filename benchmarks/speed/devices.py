@@ -31,7 +31,7 @@ CASES = {
         "training.eval_every_env_steps=18000",
     ],
 }
-QUICK = ["training.solved=null", "training.validation_episodes=8", "evaluation.episodes=8"]
+QUICK = ["training.solved=null", "training.validation_episodes=16", "evaluation.episodes=12"]
 
 
 def main() -> None:

@@ -144,6 +144,15 @@ def test_compute_without_a_gpu_takes_the_cpu_and_says_so_where_one_was_asked_for
 
 
 @pytest.mark.parametrize(
+    ("device", "observation", "expected"),
+    [("auto", "slice", "cuda"), ("auto", "cluster", "cpu"), ("cuda", "cluster", "cuda"), ("cpu", "slice", "cpu")],
+)
+def test_auto_takes_a_gpu_only_for_images(phantom, monkeypatch, device, observation, expected):
+    monkeypatch.setattr("armscan.agents.compute._has_cuda", lambda: True)
+    assert Compute(device).for_space(space_of(phantom, observation)).torch_device == expected
+
+
+@pytest.mark.parametrize(
     "compute", [Compute("cpu", "bfloat16"), pytest.param(Compute("cpu", compile=True), marks=pytest.mark.slow)]
 )
 def test_learner_learns_with_every_way_of_computing(phantom, compute):

@@ -60,6 +60,12 @@ def test_stage_refuses_volumes_that_an_observation_is_of_another_shape_on(phanto
         set_up(config)
 
 
+def test_agent_of_vectors_computes_on_the_cpu_beside_a_gpu(phantom, monkeypatch):
+    config = config_of_sizes(phantom, monkeypatch)
+    monkeypatch.setattr("armscan.agents.compute._has_cuda", lambda: True)
+    assert build_experiment(config).agent.update_note == "compiled"
+
+
 class Unfinished:
     """A user's own algorithm and agent, which learns but has no policy."""
 
