@@ -98,7 +98,7 @@ class TianshouLearner(BaseLearner):
 
     @property
     def update_note(self) -> str:
-        """Return how gradient steps are computed: `compiled`, or `Tianshou`, with a GPU's name and the reason if any."""
+        """Return how gradient steps are computed: `compiled`, or `Tianshou`, with the GPU and the reason, if any."""
         tianshou = " ".join(filter(None, ["Tianshou", super().update_note]))
         if not isinstance(self._algorithm, CompiledSAC):
             return tianshou
