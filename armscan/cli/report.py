@@ -90,7 +90,7 @@ def _reporter_on_study(name: str, uri: str, out: Path | None) -> Callable[[int |
     from armscan.sweeps.results.report import write_report
     from armscan.sweeps.storage.attributes import FINAL_SUFFIXES, JUDGEMENT_SUFFIX, check_trials
     from armscan.sweeps.storage.storage import existing_storage
-    from armscan.sweeps.study.final_eval import FinalEvaluation
+    from armscan.sweeps.study.final_eval_storage import stored_final_eval
     from armscan.sweeps.study.settings import check_study_name
     from armscan.sweeps.study.study import is_ours
 
@@ -112,7 +112,7 @@ def _reporter_on_study(name: str, uri: str, out: Path | None) -> Callable[[int |
         if (final := storage.study(name + JUDGEMENT_SUFFIX)) is not None:
             check_trials(final, n_searched=len(study.get_trials(deepcopy=False)))
             evaluated = final.get_trials(deepcopy=False)
-        stored = FinalEvaluation.stored(storage, study)
+        stored = stored_final_eval(storage, study)
         return write_report(study, evaluated, out or Path("reports", name), final=stored, refresh_s=refresh_s)
 
     return write

@@ -15,7 +15,7 @@ from armscan.sweeps.scheduling.termination import reopen
 from armscan.sweeps.storage.storage import existing_storage
 from armscan.sweeps.study.arguments import STORAGE, StudyCommand, trial_overrides
 from armscan.sweeps.study.components import check_space, read_settings
-from armscan.sweeps.study.final_eval import FinalEvaluation
+from armscan.sweeps.study.final_eval_storage import stored_final_eval
 from armscan.sweeps.study.open import open_for_work
 from armscan.sweeps.study.plan import print_plan
 from armscan.sweeps.study.population import population_of
@@ -56,7 +56,7 @@ def run_study(arguments: Sequence[str], launch: Callable[[Sequence[str]], object
     check_space(settings, task, overrides, config)
     initial = initial_trials(settings, overrides, fixed, existing)
     if given.is_plan:
-        final = FinalEvaluation.stored(storage, existing) if storage is not None and existing is not None else None
+        final = stored_final_eval(storage, existing) if storage is not None and existing is not None else None
         print_plan(settings, existing, final, initial)
         return 0
     opened = open_for_work(settings, task, config, overrides, volumes=volumes)

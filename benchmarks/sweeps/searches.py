@@ -27,8 +27,8 @@ from armscan.sweeps.scheduling.scheduler import Plan, TrialScheduler
 from armscan.sweeps.scheduling.state import StudyState
 from armscan.sweeps.space.parameter import Value
 from armscan.sweeps.study.arguments import fixed_by
+from armscan.sweeps.study.candidates import settings_of
 from armscan.sweeps.study.components import read_settings
-from armscan.sweeps.study.final_eval import settings_of
 from armscan.sweeps.study.open import open_for_work
 from armscan.sweeps.study.phase import OpenedStudy, Phase
 from armscan.sweeps.study.settings import FinalEvalSettings

@@ -21,7 +21,8 @@ from armscan.sweeps.scheduling.population import searched_values
 from armscan.sweeps.space.parameter import rounded_overrides
 from armscan.sweeps.storage.attribute_names import FAILURE
 from armscan.sweeps.storage.attributes import check_trials
-from armscan.sweeps.study.final_eval import NOTHING_SEARCHED, FinalEvaluation
+from armscan.sweeps.study.candidates import NOTHING_SEARCHED
+from armscan.sweeps.study.final_eval import FinalEvaluation
 from armscan.sweeps.study.phase import OpenedStudy
 from armscan.sweeps.study.study import best_trials
 from armscan.sweeps.tasks.attempt import trial_folder

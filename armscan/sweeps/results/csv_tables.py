@@ -33,7 +33,7 @@ from armscan.sweeps.storage.attribute_names import (
     TAKEN_FROM,
 )
 from armscan.sweeps.storage.reports import reports_of
-from armscan.sweeps.study.final_eval import key_of
+from armscan.sweeps.study.candidates import key_of
 
 MIN_TRIALS_FOR_IMPORTANCE = 4
 

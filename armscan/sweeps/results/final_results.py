@@ -15,7 +15,7 @@ from armscan.stats.on_plane import limits_among
 from armscan.stats.paired import mean_over_seeds
 from armscan.sweeps.scheduling.state import TEST_PREFIX
 from armscan.sweeps.storage.attribute_names import EPISODES, FINAL_SEED, FINALIST, METRICS
-from armscan.sweeps.study.final_eval import name_of
+from armscan.sweeps.study.candidates import name_of
 from armscan.training import TEST, Evaluation, MetricEstimates, ResultTable
 from armscan.training.baselines import RANDOM
 from armscan.training.episode_results import subject_of_volumes

@@ -19,14 +19,8 @@ from armscan.sweeps.results.final_results import ConfigResult, final_results, fi
 from armscan.sweeps.scheduling.state import CONTROL, TEST_PREFIX, metrics_of_test
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.attribute_names import METRICS, OBJECTIVES
-from armscan.sweeps.study.final_eval import (
-    NOTHING_SEARCHED,
-    FinalEvaluation,
-    name_of,
-    settings_of,
-    to_judge,
-    training_of,
-)
+from armscan.sweeps.study.candidates import NOTHING_SEARCHED, name_of, settings_of, training_of
+from armscan.sweeps.study.final_eval import FinalEvaluation, to_judge
 from armscan.sweeps.study.study import best_trials
 from armscan.training.baselines import RANDOM
 from armscan.training.episode_results import TEST_METRICS

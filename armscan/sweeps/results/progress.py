@@ -21,7 +21,8 @@ from armscan.sweeps.scheduling.state import StudyState, is_feasible, seconds_of
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.attribute_names import ENV_STEPS, FAILURE, FINAL_SEED, FINALIST, LEASE, RETRIED, STOP
 from armscan.sweeps.storage.attributes import JUDGEMENT_SUFFIX
-from armscan.sweeps.study.final_eval import FinalEvaluation, name_of
+from armscan.sweeps.study.candidates import name_of
+from armscan.sweeps.study.final_eval import FinalEvaluation
 from armscan.sweeps.study.phase import OpenedStudy, Phase
 from armscan.sweeps.study.plan import final_trainings_left
 from armscan.sweeps.study.settings import StudySettings

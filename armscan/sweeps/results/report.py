@@ -21,7 +21,8 @@ from armscan.sweeps.scheduling.state import StudyState, env_steps_of, is_feasibl
 from armscan.sweeps.scheduling.termination import REASON
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.attribute_names import FINALIST, FOLDER, LEASE, OBJECTIVES, RUN, TAKEN_FROM, TERMINATED
-from armscan.sweeps.study.final_eval import FinalEvaluation, name_of, settings_of
+from armscan.sweeps.study.candidates import name_of, settings_of
+from armscan.sweeps.study.final_eval import FinalEvaluation
 from armscan.sweeps.study.study import best_trials
 from armscan.training.metric_display import title_of, value_text
 from armscan.utils.run_files import ID_CHARS

@@ -18,7 +18,8 @@ from armscan.sweeps.scheduling.race import END_LEVEL, Race
 from armscan.sweeps.scheduling.state import CONTROL, StudyState
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.attribute_names import FIXED, OBJECTIVES
-from armscan.sweeps.study.final_eval import NOTHING_SEARCHED, FinalEvaluation, key_of, name_of, settings_of
+from armscan.sweeps.study.candidates import NOTHING_SEARCHED, key_of, name_of, settings_of
+from armscan.sweeps.study.final_eval import FinalEvaluation
 from armscan.training.metric_display import bounds_of, is_rate, title_of, value_text
 from armscan.utils.text import counted
 

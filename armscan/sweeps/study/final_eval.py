@@ -8,61 +8,39 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from statistics import fmean
-from typing import Any, Self
 
 import optuna
 from optuna.study import StudyDirection
-from optuna.trial import FrozenTrial, Trial, TrialState
-from pydantic import Field
+from optuna.trial import FrozenTrial, TrialState
 
 from armscan.config.legacy import renamed
-from armscan.errors import StudyError
 from armscan.sweeps.scheduling.claim import PlannedTrial
 from armscan.sweeps.scheduling.population import searched_values
 from armscan.sweeps.scheduling.race import MAX_SEEDS_FACTOR, Race, Scores, budget, race
 from armscan.sweeps.scheduling.state import CONTROL
 from armscan.sweeps.space.parameter import Value
 from armscan.sweeps.storage.attribute_names import (
-    FINAL_SEED,
-    FINALIST,
     FIXED,
     METRICS,
     OF_CONFIG,
     RESET_FAILURES,
     RETRIED,
-    SCHEDULE,
 )
-from armscan.sweeps.storage.attributes import FINAL_SUFFIXES, JUDGEMENT_SUFFIX, SELECTION_SUFFIX, check_trials
-from armscan.sweeps.storage.storage import Storage
+from armscan.sweeps.study.candidates import attributes_of, settings_of, training_of
 from armscan.sweeps.study.constraints import Constraint
 from armscan.sweeps.study.settings import (
     JUDGEMENT_SEEDS_ABOVE,
-    MAX_SEARCH_SEED,
     SELECTION_SEEDS_ABOVE,
     FinalEvalSettings,
-    StudySettings,
 )
 from armscan.sweeps.study.study import CONSTRAINTS, best_trials
 from armscan.utils.files import sha256
-from armscan.utils.section import Section
 
-# User attribute of the study of the selection: its settings, for reports.
-FINAL_EVAL = "final_eval"
-# Description of the control.
-NOTHING_SEARCHED = "the study's configuration without the searched values"
 ENDED_WITHOUT_SCORE = (TrialState.FAIL, TrialState.PRUNED)
-
-
-class _Stored(Section):
-    """Settings of a final evaluation, as the study of the selection stores them; see `FinalEvaluation`."""
-
-    settings: FinalEvalSettings = Field(description="a section with top_k, min_seeds, mean_seeds and judge_seeds")
-    search_seed: int = Field(ge=0, le=MAX_SEARCH_SEED, description="the largest seed of the search")
-    control: dict[str, Value] | None = Field(default=None, description="the values of the control by their keys")
 
 
 @dataclass(frozen=True)
@@ -76,7 +54,7 @@ class FinalEvaluation:
         search: The study of the search.
         selection: The study of the trainings that choose a configuration.
         judgement: The study of the trainings that judge it.
-        config_sha256: Checksum of the study's configuration without the searched values, as its trainings have it here.
+        config_sha256: `config_sha256_of` of the study, as its trainings have it here.
     """
 
     settings: FinalEvalSettings
@@ -86,62 +64,6 @@ class FinalEvaluation:
     selection: optuna.Study
     judgement: optuna.Study
     config_sha256: str
-
-    @classmethod
-    def opened(
-        cls, storage: Storage, settings: StudySettings, search: optuna.Study, control: Mapping[str, Value] | None
-    ) -> Self:
-        """Create the two studies, or load them.
-
-        Args:
-            storage: Storage of the study.
-            settings: Settings of the whole study.
-            search: Study of the search.
-            control: Values of the control by the searched keys; None if they do not lie in the space.
-        """
-
-        def make(suffix: str, directions: Sequence[StudyDirection]) -> optuna.Study:
-            study = storage.exclusive(
-                lambda: optuna.create_study(
-                    study_name=settings.name + suffix,
-                    storage=storage.optuna,
-                    directions=directions,
-                    load_if_exists=True,
-                )
-            )
-            check_trials(study, n_searched=len(search.get_trials(deepcopy=False)))
-            return study
-
-        selection = make(SELECTION_SUFFIX, search.directions)
-        stored = {
-            "settings": settings.final_eval.model_dump(),
-            "search_seed": max(settings.seeds),
-            "control": None if control is None else dict(control),
-        }
-        if selection.user_attrs.get(FINAL_EVAL) != stored:
-            selection.set_user_attr(FINAL_EVAL, stored)
-        judgement = make(JUDGEMENT_SUFFIX, [StudyDirection.MINIMIZE])
-        return cls(
-            settings.final_eval, max(settings.seeds), control, search, selection, judgement, _config_sha256(search)
-        )
-
-    @classmethod
-    def stored(cls, storage: Storage, search: optuna.Study) -> Self | None:
-        """Return the final evaluation of a stored study; None if none was begun, or an earlier version made it."""
-        selection, judgement = (storage.study(search.study_name + suffix) for suffix in FINAL_SUFFIXES)
-        if selection is None or judgement is None:
-            return None
-        for study in (selection, judgement):
-            check_trials(study, n_searched=len(search.get_trials(deepcopy=False)))
-        where, found = f"{selection.study_name}.user_attrs.{FINAL_EVAL}", selection.user_attrs.get(FINAL_EVAL)
-        if not isinstance(found, Mapping):
-            raise StudyError(f"{where} is {found!r}, but it must be the settings of the final evaluation")
-        settings = found.get("settings")
-        if isinstance(settings, Mapping) and "max_seeds" in settings:
-            # Its race had other rules.
-            return None
-        kept = _Stored.read(where, found)
-        return cls(kept.settings, kept.search_seed, kept.control, search, selection, judgement, _config_sha256(search))
 
     @property
     def selection_seeds(self) -> range:
@@ -261,11 +183,11 @@ class FinalEvaluation:
         begun = set(map(training_of, self._counted_trials(study)))
         searched = self.search.get_trials(deepcopy=False)
         # A command with another configuration has taken over the study.
-        if _config_sha256(self.search) != self.config_sha256:
+        if config_sha256_of(self.search) != self.config_sha256:
             return []
         shared = {OF_CONFIG: self.config_sha256}
         return [
-            PlannedTrial(settings_of(searched, number), _attributes(searched, number, seed) | shared)
+            PlannedTrial(settings_of(searched, number), attributes_of(searched, number, seed) | shared)
             for number, seed in trainings
             if (number, seed) not in begun
         ]
@@ -289,7 +211,8 @@ def _has_no_score(trial: FrozenTrial) -> bool:
     return trial.state in ENDED_WITHOUT_SCORE and RETRIED not in trial.user_attrs
 
 
-def _config_sha256(search: optuna.Study) -> str:
+def config_sha256_of(search: optuna.Study) -> str:
+    """Return the checksum of a study's configuration without the searched values."""
     return sha256(json.dumps(search.user_attrs.get(FIXED), sort_keys=True).encode())
 
 
@@ -301,36 +224,6 @@ def to_judge(race: Race) -> list[int]:
     if race.chosen is None:
         return [] if race.is_over else [CONTROL]
     return list(dict.fromkeys((race.chosen, CONTROL)))
-
-
-def training_of(trial: FrozenTrial | Trial) -> tuple[int, int]:
-    """Return the configuration and the seed of a final training."""
-    return int(trial.user_attrs[FINALIST]), int(trial.user_attrs[FINAL_SEED])
-
-
-def name_of(number: int) -> str:
-    """Return the name of a configuration for users: `control`, or `trial 7`."""
-    return "control" if number == CONTROL else f"trial {number}"
-
-
-def key_of(number: int) -> int | str:
-    """Return the name of a configuration in files: the number of its trial, or `control`."""
-    return "control" if number == CONTROL else number
-
-
-def settings_of(searched: Sequence[FrozenTrial], number: int) -> dict[str, Any]:
-    """Return the values of a configuration by their keys; the control has none.
-
-    Args:
-        searched: Trials of the search.
-        number: Number of one of them, or `CONTROL`.
-    """
-    return {} if number == CONTROL else renamed(searched_values(searched[number]))
-
-
-def _attributes(searched: Sequence[FrozenTrial], number: int, seed: int) -> dict[str, Any]:
-    schedule = [] if number == CONTROL else searched[number].user_attrs.get(SCHEDULE, [])
-    return {FINALIST: number, FINAL_SEED: seed} | ({SCHEDULE: schedule} if schedule else {})
 
 
 def n_trainings(settings: FinalEvalSettings) -> tuple[int, int]:

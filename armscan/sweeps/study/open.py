@@ -18,10 +18,12 @@ from armscan.sweeps.scheduling.scheduler import TrialScheduler
 from armscan.sweeps.scheduling.termination import Termination
 from armscan.sweeps.storage.attribute_names import STUDY_RUN
 from armscan.sweeps.storage.storage import Storage, open_storage
+from armscan.sweeps.study.candidates import training_of
 from armscan.sweeps.study.components import make_terminator
 from armscan.sweeps.study.constraints import constrained
 from armscan.sweeps.study.dashboard import note_run
-from armscan.sweeps.study.final_eval import FinalEvaluation, training_of
+from armscan.sweeps.study.final_eval import FinalEvaluation
+from armscan.sweeps.study.final_eval_storage import open_final_eval
 from armscan.sweeps.study.phase import OpenedStudy, Phase
 from armscan.sweeps.study.population import population_of
 from armscan.sweeps.study.settings import StudySettings
@@ -91,7 +93,7 @@ def open_for_work(
     final_eval = None
     if settings.final_eval.top_k:
         control, misfit = values_of(settings.space, overrides)
-        final_eval = FinalEvaluation.opened(storage, settings, study, None if misfit else control)
+        final_eval = open_final_eval(storage, settings, study, None if misfit else control)
     finals = _final_phases(search, settings, task, final_eval) if final_eval is not None else ()
     return OpenedStudy(settings=settings, config=config, search=search, final_eval=final_eval, finals=finals)
 

@@ -21,7 +21,9 @@ from armscan.sweeps.scheduling.state import CONTROL
 from armscan.sweeps.stop import stop_trial
 from armscan.sweeps.storage.attribute_names import FINALIST, GENERATION, MEMBER, METRICS, SCHEDULE
 from armscan.sweeps.storage.storage import open_storage
-from armscan.sweeps.study.final_eval import FinalEvaluation, n_trainings, training_of
+from armscan.sweeps.study.candidates import training_of
+from armscan.sweeps.study.final_eval import n_trainings
+from armscan.sweeps.study.final_eval_storage import open_final_eval, stored_final_eval
 from armscan.sweeps.study.plan import final_trainings_left, hours_left
 from armscan.sweeps.study.settings import FinalEvalSettings
 from armscan.sweeps.study.study import make_study
@@ -63,7 +65,7 @@ def searched(uri, objectives=("mean_steps",), fixed=None, constraints=(), **chan
 
 def opened(uri, **changes):
     storage, asked, search = searched(uri, **changes)
-    final = FinalEvaluation.opened(storage, asked, search, None)
+    final = open_final_eval(storage, asked, search, None)
     # A training may lose its worker several times.
     limits = Limits(n_trials=10**9, max_retries=10)
     plans = {final.selection: final.missing_of_selection, final.judgement: final.missing_of_judgement}
@@ -255,10 +257,10 @@ def test_control_that_is_the_best_is_the_result(storage_uri):
 def test_trial_with_the_settings_of_the_control_is_no_candidate_beside_it(storage_uri, top_k, candidates):
     storage, asked, search = searched(storage_uri, top_k=top_k)
     # Neither a sampled trial nor one that was taken over is marked as having them.
-    final = FinalEvaluation.opened(storage, asked, search, search.trials[0].params)
+    final = open_final_eval(storage, asked, search, search.trials[0].params)
     assert final.candidates() == candidates
     # As a report reads it.
-    assert FinalEvaluation.stored(open_storage(storage_uri), search).candidates() == candidates
+    assert stored_final_eval(open_storage(storage_uri), search).candidates() == candidates
 
 
 def test_training_that_failed_leaves_its_candidate_out_and_the_study_has_a_result(storage_uri):
@@ -354,14 +356,14 @@ def test_note_on_a_study_that_has_no_result_is_empty(storage_uri):
 
 def test_final_evaluation_is_read_from_the_storage_and_that_of_an_earlier_version_is_none(storage_uri):
     storage, asked, search = searched(storage_uri)
-    assert FinalEvaluation.stored(storage, search) is None
+    assert stored_final_eval(storage, search) is None
     optuna.create_study(study_name="a-judged", storage=storage.optuna)
-    assert FinalEvaluation.stored(storage, search) is None
-    final = FinalEvaluation.opened(storage, asked, search, None)
-    assert FinalEvaluation.stored(open_storage(storage_uri), search).settings == final.settings
+    assert stored_final_eval(storage, search) is None
+    final = open_final_eval(storage, asked, search, None)
+    assert stored_final_eval(open_storage(storage_uri), search).settings == final.settings
     before = {"top_k": 2, "min_seeds": 3, "max_seeds": 8, "judge_seeds": 5}
     final.selection.set_user_attr("final_eval", {"settings": before, "search_seed": 0, "control": None})
-    assert FinalEvaluation.stored(storage, search) is None
+    assert stored_final_eval(storage, search) is None
 
 
 def test_latest_trial_of_each_member_is_trained_with_its_whole_schedule(storage_uri):
@@ -376,7 +378,7 @@ def test_latest_trial_of_each_member_is_trained_with_its_whole_schedule(storage_
     behind.suggest_float("agent.lr", 1e-4, 1e-2)
     # Its next generation is not complete.
     search.tell(behind, 98.0)
-    final = FinalEvaluation.opened(storage, asked, search, None)
+    final = open_final_eval(storage, asked, search, None)
     # Better values of earlier generations are not of whole trainings.
     assert final.candidates() == [CONTROL, behind.number, member.number]
     planned = [each for each in final.missing_of_selection() if each.attributes[FINALIST] == member.number]

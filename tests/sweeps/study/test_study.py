@@ -10,7 +10,7 @@ from armscan.sweeps.space.space import Space
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.arguments import StudyCommand, trial_overrides
 from armscan.sweeps.study.components import read_settings
-from armscan.sweeps.study.final_eval import FinalEvaluation
+from armscan.sweeps.study.final_eval_storage import open_final_eval
 from armscan.sweeps.study.settings import FinalEvalSettings, StudySettings
 from armscan.sweeps.study.study import LATER, existing_study, make_study
 
@@ -171,7 +171,7 @@ def test_study_of_an_earlier_version_goes_on_with_the_names_of_this_one(storage_
     final_eval = FinalEvalSettings(top_k=1, min_seeds=1, mean_seeds=1, judge_seeds=1)
     now = settings(space=Space.read({"agent.utd_ratio": lr}), final_eval=final_eval)
     search = make_study(storage, now, fixed)
-    control, best = FinalEvaluation.opened(storage, now, search, None).missing_of_selection()
+    control, best = open_final_eval(storage, now, search, None).missing_of_selection()
     assert (control.params, best.params) == ({}, {"agent.utd_ratio": ratio})
 
 

@@ -15,7 +15,7 @@ from armscan.sweeps.storage.attribute_names import TAKEN_FROM
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.arguments import StudyCommand, trial_overrides
 from armscan.sweeps.study.components import read_settings
-from armscan.sweeps.study.final_eval import FinalEvaluation
+from armscan.sweeps.study.final_eval_storage import open_final_eval
 from armscan.sweeps.study.settings import FinalEvalSettings
 from armscan.sweeps.study.study import best_trials, make_study
 from armscan.sweeps.study.warm_start import N_ENQUEUED, InitialTrials, initial_trials, values_of
@@ -164,8 +164,8 @@ def test_taken_trial_with_the_values_of_the_control_is_no_candidate_beside_it(st
     final_eval = FinalEvalSettings(top_k=2, min_seeds=1, mean_seeds=1, judge_seeds=1)
     asked, storage, study = made = study_in("now", space, warm_start=["before"], final_eval=final_eval)
     begin(made)
-    assert FinalEvaluation.opened(storage, asked, study, None).candidates() == [CONTROL, 0, 1]
-    assert FinalEvaluation.opened(storage, asked, study, control).candidates() == [CONTROL, 1]
+    assert open_final_eval(storage, asked, study, None).candidates() == [CONTROL, 0, 1]
+    assert open_final_eval(storage, asked, study, control).candidates() == [CONTROL, 1]
 
 
 def test_settings_of_a_taken_trial_are_not_tried_again(study_in):
