@@ -23,10 +23,12 @@ class Compute:
     """Device and precision of tensors, and compilation of networks.
 
     Args:
-        device: Device of the tensors: `cpu`, `cuda`, or `auto` for `cuda` if there is one; see `for_space` too.
+        device: Device of the tensors: `cpu`, `cuda`, or `auto`, which is `cuda` if torch finds a CUDA device, but `cpu`
+            for agents without images (see `for_space`). Default: `auto`.
         precision: Precision of the products: `float32`, or `bfloat16` for mixed precision (products in 16 bits, sums
-            and weights in 32).
+            and weights in 32). Default: `float32`.
         compile: Whether to compile networks with `torch.compile`, which takes a minute and requires a C++ compiler.
+            Default: False.
 
     Raises:
         InvalidValueError: If a value is unknown, or torch finds no such device.
@@ -49,7 +51,7 @@ class Compute:
         return "cuda" if self.device == "cuda" or (self.device == "auto" and _has_cuda()) else "cpu"
 
     def for_space(self, space: spaces.Space[Any]) -> Compute:
-        """Return how an agent of these observations computes: without images, `auto` is the CPU, which is faster then.
+        """Return the settings for an agent with these observations: `auto` is `cpu` without images.
 
         Args:
             space: Observation space of one environment.
@@ -58,7 +60,7 @@ class Compute:
 
     @property
     def is_float32_on_cpu(self) -> bool:
-        """Return whether tensors are on the CPU in 32 bits, so that a plain copy of a network computes the same."""
+        """Whether tensors are on the CPU in 32 bits, so that a plain copy of a network computes the same."""
         return self.torch_device == "cpu" and self.precision == "float32"
 
     def apply_to(self, network: nn.Module) -> None:

@@ -77,12 +77,12 @@ def list_runs(form: str, children: bool, tracking: str, sort: str, limit: int | 
 
     docs/runs.md explains the columns.
     """
-    from armscan.runs.query import find
+    from armscan.runs.query import find_runs
     from armscan.runs.rows import collapse, sort_rows
     from armscan.runs.tables import write_rows
 
     with _open(tracking) as client:
-        rows = sort_rows(collapse(client, find(client, **selected)), sort, limit)
+        rows = sort_rows(collapse(client, find_runs(client, **selected)), sort, limit)
         if not rows and form == "table":
             print(f"no run of {client.uri} is selected")
         else:
@@ -121,12 +121,12 @@ def prune(what: str, apply: bool, tracking: str, sort: str, limit: int | None, *
 
     from armscan.config.command_hints import armscan_command
     from armscan.runs.prune import plan, remove_planned
-    from armscan.runs.query import find
+    from armscan.runs.query import find_runs
     from armscan.runs.rows import RunRow, sort_rows
     from armscan.runs.tables import print_prune_plan
 
     with _open(tracking) as client:
-        rows = [RunRow(client, run) for run in find(client, **selected)]
+        rows = [RunRow(client, run) for run in find_runs(client, **selected)]
         items = plan(client, [row.run for row in sort_rows(rows, sort, limit)], what)
         if apply:
             return remove_planned(client, items, what)

@@ -216,7 +216,7 @@ def log_result(tracked: TrackedRun, result: TrainingResult | None, reached: RunR
         tracked.log_metrics({"best_env_step": result.best.n_env_steps}, n_env_steps=result.reports[-1].n_env_steps)
         tracked.log_model(reached.model_metrics(), n_env_steps=result.best.n_env_steps)
     curve = f"\n\n![learning curve]({artifact_address(tracked.run_id, LEARNING_CURVE_FILE)})" if result else ""
-    tracked.set_note(reached.markdown() + curve)
+    tracked.set_description(reached.markdown() + curve)
 
 
 @contextlib.contextmanager

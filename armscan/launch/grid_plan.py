@@ -54,7 +54,7 @@ def check_grid(words: Sequence[str]) -> None:
     overrides = [word for word in words if word not in MULTIRUN]
     if len(overrides) == len(words) or any(word.startswith(NOT_CHECKED) for word in overrides):
         return
-    print("preparing a grid: its words are checked first", flush=True)
+    print("preparing a grid: checking its overrides", flush=True)
     # Deferred: it takes time, so the line above comes first.
     from armscan.experiment.build import check_config, check_effects
 

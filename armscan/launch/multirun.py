@@ -81,7 +81,7 @@ class Multirun(Callback):
             return
         check_launcher(config.hydra.runtime.choices[LAUNCHER])
         folder = Path(config.hydra.sweep.dir)
-        print(f"preparing a multirun in {folder}", flush=True)
+        print(f"preparing a grid in {folder}", flush=True)
         # Deferred: it loads MLflow, after the first line is printed.
         from armscan.tracking import begin_outbox, code_state, open_store
 

@@ -22,7 +22,7 @@ from armscan.envs.rules import Observed
 from armscan.errors import ExportError, is_interruption
 from armscan.policies.model import ONNX_FILE, Arrays, arrays_of, model_sha256, write_model
 from armscan.tracking import TrackedRun
-from armscan.tracking.client import reason_in
+from armscan.tracking.tracking_store import reason_in
 from armscan.training.domain import with_crops
 from armscan.training.episode_results import Env
 from armscan.utils.arrays import FloatArray

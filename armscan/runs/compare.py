@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from armscan.tracking.client import TrackingStore
 from armscan.tracking.histories import metric_histories
 from armscan.tracking.system_metrics import PREFIX
 from armscan.tracking.tags import SELECTION_PREFIX
+from armscan.tracking.tracking_store import TrackingStore
 
 # Prefixes of metrics of time and machine, which differ from run to run, and of those that a reproduction lacks.
 LEFT_OUT = (PREFIX, "speed/", "wall_s", "training_s", SELECTION_PREFIX)

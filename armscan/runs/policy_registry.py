@@ -20,10 +20,10 @@ from armscan.policies.build import SUM_TAG, facts_of, make_model, onnx_answers, 
 from armscan.policies.model import ONNX_FILE, model_sha256
 from armscan.runs.model_card import Card
 from armscan.tracking import FoundRun, check_artifacts, load_run
-from armscan.tracking.client import reason_in
 from armscan.tracking.logged_model import VERSIONS_TAG, model_of
 from armscan.tracking.run import MODEL_FILE
 from armscan.tracking.store import store_errors
+from armscan.tracking.tracking_store import reason_in
 from armscan.training import TEST, TrainingDomain
 from armscan.utils.run_files import POLICY_FOLDER
 

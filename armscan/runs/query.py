@@ -11,11 +11,11 @@ from mlflow.exceptions import MlflowException
 
 from armscan.errors import InvalidValueError, listed
 from armscan.tracking import TrackingStore, find_run
-from armscan.tracking.client import all_pages, reason_in
 from armscan.tracking.tags import AGENT_TAG, OBS_TAG, PARENT_TAG
+from armscan.tracking.tracking_store import all_pages, reason_in
 
 
-def find(
+def find_runs(
     client: TrackingStore,
     *,
     experiment: str | None = None,

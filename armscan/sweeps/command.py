@@ -65,7 +65,7 @@ def run_study(arguments: Sequence[str], launch: Callable[[Sequence[str]], object
         if each.add(search.storage, search.study):
             print_sentence(printable(each.message))
     if reopen(search.study, search.storage, settings.asked):
-        print(f"{settings.name}: had ended by itself, going on")
+        print(f"{settings.name}: had ended early, and continues")
     blocked = [] if opened.final_eval is None else opened.final_eval.blocked()
     for phase in opened.phases:
         if phase.scheduler.resume():

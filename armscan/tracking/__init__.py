@@ -1,6 +1,5 @@
 """MLflow tracking: the store, its runs, and their plots."""
 
-from armscan.tracking.client import TrackingStore
 from armscan.tracking.environment import environment_file, environment_tags
 from armscan.tracking.git import code_state
 from armscan.tracking.lookup import (
@@ -17,13 +16,13 @@ from armscan.tracking.plots import draw_learning_curve
 from armscan.tracking.run import TrackedRun
 from armscan.tracking.sanitize import flatten, tags_of
 from armscan.tracking.store import check_artifacts, check_settings, open_existing_store, open_store
-from armscan.tracking.sync import abandon, begin_outbox, note_end, sync, upload_pending
+from armscan.tracking.sync import begin_outbox, fail_dead_runs, note_end, sync, upload_pending
+from armscan.tracking.tracking_store import TrackingStore
 
 __all__ = [
     "FoundRun",
     "TrackedRun",
     "TrackingStore",
-    "abandon",
     "begin_outbox",
     "check_artifacts",
     "check_run_id",
@@ -33,6 +32,7 @@ __all__ = [
     "draw_learning_curve",
     "environment_file",
     "environment_tags",
+    "fail_dead_runs",
     "find_run",
     "flatten",
     "load_agent_run",

@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Any
 
-from armscan.tracking.client import TrackingStore
+from armscan.tracking.tracking_store import TrackingStore
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient

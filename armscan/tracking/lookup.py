@@ -14,9 +14,9 @@ from packaging.version import InvalidVersion, Version
 import armscan
 from armscan.config.trust import needs_trust, stored_config
 from armscan.errors import InvalidValueError, TrackingError, TrackingUnavailableError, few, listed
-from armscan.tracking.client import TrackingStore, all_pages
 from armscan.tracking.store import open_existing_store, store_errors
 from armscan.tracking.tags import EVALUATED_TAG, VERSION_TAG
+from armscan.tracking.tracking_store import TrackingStore, all_pages
 from armscan.utils.files import sha256
 from armscan.utils.run_files import BEST_CHECKPOINT, CONFIG_FILE, SHA256_TAGS, VOLUMES_FILE
 from armscan.utils.strict_yaml import load_yaml

@@ -56,7 +56,7 @@ class Note:
         atomic_write(file, json.dumps(told))
 
     @property
-    def is_abandoned(self) -> bool:
+    def is_dead(self) -> bool:
         """Whether the process that tracked the run is known to have died."""
         return self.process.is_here and not self.process.is_alive
 

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, Self
 
 from armscan.config.command_hints import armscan_command
 from armscan.errors import TrackingError, is_interruption
-from armscan.tracking.client import TrackingStore
 from armscan.tracking.environment import environment_tags
 from armscan.tracking.git import DIFF_SUM, code_state
 from armscan.tracking.notes import forget
@@ -18,6 +17,7 @@ from armscan.tracking.outbox import Address, Outbox, file_of, now_ms
 from armscan.tracking.sanitize import params_of, tags_of
 from armscan.tracking.system_metrics import PREFIX, SystemMetrics
 from armscan.tracking.tags import FAILURE_TAG, PARENT_TAG, PRUNED_TAG
+from armscan.tracking.tracking_store import TrackingStore
 from armscan.tracking.uploader import Uploader
 from armscan.utils.files import atomic_write
 from armscan.utils.log import log
@@ -213,7 +213,7 @@ class TrackedRun:
         """
         self._add(model=[n_env_steps, {part: list(names) for part, names in metrics.items()}])
 
-    def set_note(self, text: str) -> None:
+    def set_description(self, text: str) -> None:
         """Set the run's description in Markdown, shown at the top of its MLflow page, unless a person wrote one."""
         self._add(note=text)
 

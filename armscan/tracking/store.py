@@ -19,7 +19,7 @@ from filelock import FileLock
 from armscan.config.credentials import SERVER_PASSWORD, TRACKING_PASSWORD, check_address, database_url, read_password
 from armscan.config.trust import check_artifact_address
 from armscan.errors import TrackingError
-from armscan.tracking.client import TrackingStore, reason_in
+from armscan.tracking.tracking_store import TrackingStore, reason_in
 from armscan.tracking.view import VIEW, VIEW_TAG
 from armscan.utils.files import SQLITE_PREFIX, check_writable, nearest_existing, sqlite_file
 from armscan.utils.validation import check_bool, check_float

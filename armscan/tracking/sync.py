@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING
 
 from armscan.config.trust import TRUST
 from armscan.errors import FolderInUseError, TrackingError, UntrustedError
-from armscan.tracking.client import NOT_THERE, TrackingStore, reason_in
 from armscan.tracking.notes import Note, forget, notes
 from armscan.tracking.outbox import CHANNELS, Address, Outbox, now_ms, outbox_files
 from armscan.tracking.run import SHORT_WAIT_S, TrackedRun
 from armscan.tracking.sanitize import tags_of
 from armscan.tracking.store import absolute
 from armscan.tracking.tags import FAILURE_TAG, FOLDER_TAG
+from armscan.tracking.tracking_store import NOT_THERE, TrackingStore, reason_in
 from armscan.tracking.uploader import upload
 from armscan.utils.log import log
 from armscan.utils.processes import ProcessInfo
@@ -79,7 +79,7 @@ def _synced(files: Iterable[Path], opened: Callable[[str], TrackingStore], *, tr
         try:
             with contextlib.closing(Outbox(file, timeout_s=0.0)) as outbox:
                 run_id, uri = outbox.address.run_id, outbox.address.uri
-                if outbox.status not in ENDED and _is_abandoned(run_id, file):
+                if outbox.status not in ENDED and _is_dead(run_id, file):
                     outbox.add(tags={FAILURE_TAG: PROCESS_DIED})
                     outbox.add(status=("FAILED", now_ms()))
                 if outbox.is_uploaded:
@@ -90,7 +90,7 @@ def _synced(files: Iterable[Path], opened: Callable[[str], TrackingStore], *, tr
                     uploads.append(_upload_of(outbox, store, trust=trust))
                 stores[uri] = store
         except FileNotFoundError:
-            if _is_abandoned(file.stem, file) and (left := _end_removed(file.stem, opened)) is not None:
+            if _is_dead(file.stem, file) and (left := _end_removed(file.stem, opened)) is not None:
                 uploads.append(Upload(file.parent.parent, file.stem, 0, left))
         except FolderInUseError:
             uploads.append(Upload(file.parent.parent, None, 0, IN_USE))
@@ -99,10 +99,10 @@ def _synced(files: Iterable[Path], opened: Callable[[str], TrackingStore], *, tr
     return uploads
 
 
-def _is_abandoned(run_id: str, file: Path) -> bool:
+def _is_dead(run_id: str, file: Path) -> bool:
     """Return whether the process that wrote this outbox of a run has died on this machine."""
     note = Note.of(run_id)
-    return note is not None and note.is_abandoned and note.outbox.resolve() == file.resolve()
+    return note is not None and note.is_dead and note.outbox.resolve() == file.resolve()
 
 
 def _end_removed(run_id: str, opened: Callable[[str], TrackingStore]) -> str | None:
@@ -192,7 +192,7 @@ def _upload_pending(store: TrackingStore) -> None:
             forget(run_id)
 
 
-def abandon(folder: Path, store: TrackingStore, reason: str) -> None:
+def fail_dead_runs(folder: Path, store: TrackingStore, reason: str) -> None:
     """Mark the runs of dead processes in a folder tree as FAILED.
 
     Entries that the store cannot take now stay in the folders of the runs.

@@ -1,7 +1,7 @@
 """Names of the tags of runs in MLflow."""
 
 # MLflow's own tags: the parent of a run, and its description.
-PARENT_TAG, NOTE_TAG = "mlflow.parentRunId", "mlflow.note.content"
+PARENT_TAG, DESCRIPTION_TAG = "mlflow.parentRunId", "mlflow.note.content"
 # Absolute path of a run's folder, and the name of its machine.
 FOLDER_TAG, HOST_TAG = "folder", "host"
 # Version of armscan that made a run.

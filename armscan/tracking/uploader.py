@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 from armscan.config.trust import TRUST
 from armscan.errors import TrackingError, UntrustedError
-from armscan.tracking.client import NOT_THERE, TrackingStore, reason_in, unavailable_reason
 from armscan.tracking.logged_model import upload_model
 from armscan.tracking.outbox import CHANNELS, Channel, Outbox, file_and_place
 from armscan.tracking.sanitize import MAX_PARAM_CHARS, MAX_TAG_CHARS, metric_name_of, truncate
-from armscan.tracking.tags import NOTE_TAG
+from armscan.tracking.tags import DESCRIPTION_TAG
+from armscan.tracking.tracking_store import NOT_THERE, TrackingStore, reason_in, unavailable_reason
 from armscan.utils.files import sha256
 from armscan.utils.log import log
 from armscan.utils.retry import FIRST_PAUSE_S
@@ -32,7 +32,7 @@ ENTRIES_AT_ONCE = 200
 # Length of a dataset's digest; MLflow's limit is 36.
 DIGEST_CHARS = 16
 # SHA-256 of the description that armscan wrote: one with another checksum was written by a person.
-NOTE_SUM_TAG = "note.sha256"
+DESCRIPTION_SUM_TAG = "note.sha256"
 LONGEST_PAUSE_S, LOOK_S = 5.0, 0.5
 
 
@@ -232,6 +232,8 @@ def set_description(client: MlflowClient | TrackingStore, run_id: str, text: str
 
     text = truncate(text, MAX_TAG_CHARS, RESULTS_PAGE)
     tags = client.get_run(run_id).data.tags
-    if NOTE_TAG not in tags or sha256(tags[NOTE_TAG].encode()) == tags.get(NOTE_SUM_TAG):
+    if DESCRIPTION_TAG not in tags or sha256(tags[DESCRIPTION_TAG].encode()) == tags.get(DESCRIPTION_SUM_TAG):
         # In one request: a description without its checksum would look like a person's.
-        client.log_batch(run_id, tags=[RunTag(NOTE_TAG, text), RunTag(NOTE_SUM_TAG, sha256(text.encode()))])
+        client.log_batch(
+            run_id, tags=[RunTag(DESCRIPTION_TAG, text), RunTag(DESCRIPTION_SUM_TAG, sha256(text.encode()))]
+        )

@@ -1,13 +1,14 @@
-"""Measure whether a GPU updates many SAC learners at once faster than processor cores do.
+"""Measure gradient steps of many SAC learners per second: on one GPU, and on CPU cores.
 
     python -m benchmarks.speed.population [--seconds S]
 
-Two ways to share a GPU, both with batches of 256, beside armscan's compiled update on one core:
+Every batch has 256 transitions. Two ways are measured:
 
-- Stacked: the parameters of all learners in one tensor for each layer, so that a layer of all learners is one batch of
-  products, and one graph of CUDA kernels is a gradient step of each. Each learner has a replay buffer of its own, in
-  the GPU's memory.
-- Processes: each has a learner of its own, as the workers of a study have.
+- Processes: each process trains one learner on one thread, as a worker of a study does. All of them share the GPU, or
+  each has a CPU core, with armscan's compiled update for vectors.
+- Stacked (GPU only): each layer's parameters of all learners are one tensor, so that a layer of all learners is one
+  batched matrix product. One CUDA graph is a gradient step of each learner. Each learner has a replay buffer of its
+  own, in the GPU's memory.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ STACK_SIZES, N_PROCESSES = (1, 16, 64, 256, 1024), (1, 4, 16)
 CASES = ("cluster, 64-64", "slice_channels 48 x 36")
 
 
-class Stacked(nn.Module):
+class StackedMLPs(nn.Module):
     """Fully connected networks with ReLU, side by side.
 
     Args:
@@ -66,15 +67,18 @@ class Population:
 
     def __init__(self, n: int, n_features: int, device: str) -> None:
         self.n, self.device = n, device
-        self.actor = Stacked(n, n_features, *HIDDEN, 2 * N_ACTION).to(device)
+        self.actor = StackedMLPs(n, n_features, *HIDDEN, 2 * N_ACTION).to(device)
         self.critics, self.targets = (
-            Stacked(N_TWINS * n, n_features + N_ACTION, *HIDDEN, 1).to(device) for _ in range(2)
+            StackedMLPs(N_TWINS * n, n_features + N_ACTION, *HIDDEN, 1).to(device) for _ in range(2)
         )
         self.targets.load_state_dict(self.critics.state_dict())
         self.log_alpha = torch.full((n, 1), 0.1, device=device).log_().requires_grad_()
         self.obs, self.next_obs = (torch.randn(n, N_STORED, n_features, device=device) for _ in range(2))
         self.actions = torch.rand(n, N_STORED, N_ACTION, device=device) * 2 - 1
-        self.rewards, self.is_going = torch.randn(n, N_STORED, device=device), torch.ones(n, N_STORED, device=device)
+        self.rewards, self.not_terminated = (
+            torch.randn(n, N_STORED, device=device),
+            torch.ones(n, N_STORED, device=device),
+        )
         options: dict[str, Any] = {"lr": LR, "fused": True, "capturable": device == "cuda"}
         parts = (self.actor.parameters(), self.critics.parameters(), [self.log_alpha])
         self.adams = [torch.optim.Adam(parameters, **options) for parameters in parts]
@@ -88,7 +92,7 @@ class Population:
         with torch.no_grad():
             next_actions, next_log_prob = self._sampled(next_obs)
             values = self._values(self.targets, next_obs, next_actions).amin(0) - alpha * next_log_prob
-            returns = self.rewards[each, chosen] + GAMMA * self.is_going[each, chosen] * values
+            returns = self.rewards[each, chosen] + GAMMA * self.not_terminated[each, chosen] * values
         # Sums over learners: no learner's gradient depends on another.
         errors = self._values(self.critics, obs, actions) - returns
         self._step(1, errors.square().mean(2).sum())
@@ -109,7 +113,7 @@ class Population:
         squashed = 2.0 * (0.6931471805599453 - raw - functional.softplus(-2.0 * raw))
         return torch.tanh(raw), (log_prob - squashed).sum(2)
 
-    def _values(self, critics: Stacked, obs: Tensor, actions: Tensor) -> Tensor:
+    def _values(self, critics: StackedMLPs, obs: Tensor, actions: Tensor) -> Tensor:
         pairs = torch.cat([obs, actions], dim=2)
         return critics(torch.cat([pairs] * N_TWINS)).view(N_TWINS, self.n, -1)
 
@@ -135,7 +139,7 @@ def graph_of(population: Population) -> Callable[[], None]:
     return graph.replay
 
 
-def stacked_per_s(n: int, n_features: int, seconds: float) -> float:
+def stacked_gradient_steps_per_s(n: int, n_features: int, seconds: float) -> float:
     """Return the gradient steps per second of `n` stacked learners together."""
     update = graph_of(Population(n, n_features, "cuda"))
     torch.cuda.synchronize()
@@ -148,19 +152,19 @@ def stacked_per_s(n: int, n_features: int, seconds: float) -> float:
     return n * n_updates / (time.perf_counter() - start_s)
 
 
-def learner_per_s(case: str) -> float:
-    """Return the gradient steps per second of one learner: of `CASE; DEVICE; SECONDS`."""
+def gradient_steps_per_s(case: str) -> float:
+    """Return the gradient steps per second of one learner, for a request `CASE; DEVICE; SECONDS`."""
     from armscan.agents import Compute
     from benchmarks.speed import updates
 
     name, device, seconds = case.split("; ")
-    if case not in _MEASURES:
+    if case not in _UPDATERS:
         torch.set_num_threads(1)
-        _MEASURES[case] = updates.updater(*updates.CASES[name], Compute(device))
-    return _MEASURES[case](float(seconds))
+        _UPDATERS[case] = updates.updater(*updates.CASES[name], Compute(device))
+    return _UPDATERS[case](float(seconds))
 
 
-_MEASURES: dict[str, Callable[[float], float]] = {}
+_UPDATERS: dict[str, Callable[[float], float]] = {}
 
 
 def main() -> None:
@@ -170,10 +174,10 @@ def main() -> None:
     parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.serve:
-        serve(learner_per_s)
+        serve(gradient_steps_per_s)
         return
     devices = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
-    print_head("learners", "device", "processes", "updates/s together", "of one process")
+    print_head("learners", "device", "processes", "gradient steps/s together", "of one process")
     for case in CASES:
         for device in devices:
             for n in (each for each in N_PROCESSES if each <= (os.cpu_count() or 1)):
@@ -188,9 +192,9 @@ def main() -> None:
                 print_row(case, device, n, f"{sum(rates):,.0f}", f"{sum(rates) / n:,.1f}")
     if "cuda" in devices:
         n_features = _n_features()
-        print_head("stacked learners, 64-64", "updates/s together", "of each learner")
+        print_head("stacked learners, 64-64", "gradient steps/s together", "of each learner")
         for n in STACK_SIZES:
-            rate = stacked_per_s(n, n_features, given.seconds)
+            rate = stacked_gradient_steps_per_s(n, n_features, given.seconds)
             print_row(n, f"{rate:,.0f}", f"{rate / n:,.1f}")
 
 

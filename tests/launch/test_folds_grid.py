@@ -13,7 +13,7 @@ from armscan.experiment.job import JobOutcome
 from armscan.launch.folds_grid import with_folds
 from armscan.launch.folds_table import AGENT, folds_table, keep_table
 from armscan.launch.grid_plan import print_grid_plan
-from armscan.tracking.tags import NOTE_TAG
+from armscan.tracking.tags import DESCRIPTION_TAG
 from armscan.training import TEST, Evaluation, MetricEstimates
 from armscan.utils.run_files import RESULTS_PAGE
 from tests.support.stores import store_in
@@ -176,7 +176,7 @@ def test_page_and_description_of_all_folds_say_what_is_missing(tmp_path, databas
     of_jobs = shown.partition("<h2>Jobs</h2>")[2]
     assert "data.fold=1" in of_jobs
     assert "failed" in of_jobs
-    assert store.get_run(run_id).data.tags[NOTE_TAG].startswith("1 of 2 jobs are missing\n\n")
+    assert store.get_run(run_id).data.tags[DESCRIPTION_TAG].startswith("1 of 2 jobs are missing\n\n")
 
 
 def test_no_job_is_the_best_of_those_that_are_tested_on_other_wrists():

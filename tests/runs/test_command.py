@@ -10,7 +10,7 @@ import pytest
 from mlflow import MlflowClient
 
 from armscan.runs.prune import plan, remove, remove_planned
-from armscan.runs.query import find
+from armscan.runs.query import find_runs
 from armscan.runs.run_folder import RunSkippedError
 from armscan.tracking import open_store
 from armscan.tracking.outbox import file_of
@@ -96,7 +96,7 @@ def removed_by_another(folder, store, run_id, locked):
 def test_run_is_left_that_somebody_has_begun_to_use_since_it_was_planned(store, make_run, locked, tmp_path, change):
     client, folder = store[0], tmp_path / "outputs" / "tiny"
     run_id = make_run()
-    (case,) = plan(client, find(client), "folders")
+    (case,) = plan(client, find_runs(client), "folders")
     assert case.left is None
     reason = change(folder, store, run_id, locked)
     with pytest.raises(RunSkippedError, match=reason):
@@ -108,7 +108,7 @@ def test_run_is_left_that_somebody_has_begun_to_use_since_it_was_planned(store, 
 @pytest.mark.parametrize("what", ["checkpoints", "folders"])
 def test_what_another_prune_has_removed_is_no_failure(store, make_run, capsys, tmp_path, what):
     run_id, client = make_run(), store[0]
-    planned = plan(client, find(client), "folders")
+    planned = plan(client, find_runs(client), "folders")
     for case in planned:
         remove(client, case, "folders")
     assert remove_planned(client, planned, what) == 0

@@ -157,7 +157,7 @@ def test_study_ends_by_itself_where_the_noise_between_seeds_is_larger_than_what_
     reason = (
         r"after \d+ trials, further ones may gain at most (\S+) in mean_return, and the noise between seeds is ([\d.]+)"
     )
-    told = re.search(f"the study has ended by itself: ({reason})", unwrapped(ended.stdout))
+    told = re.search(f"the study has ended early: ({reason})", unwrapped(ended.stdout))
     assert float(told[2]) < float(told[3])
     # The plan gives the same reason, and the same command prints the same result without a worker.
     plan = unwrapped(armscan_run(*words, "--plan", cwd=tmp_path).stdout)

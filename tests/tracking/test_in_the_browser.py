@@ -138,11 +138,11 @@ def test_best_checkpoint_is_a_model_with_metrics_of_its_run_and_their_volumes_on
 
 def test_description_of_a_run_is_its_table_unless_somebody_wrote_one(tracked, store, tmp_path):
     client, experiment_id = store()
-    tracked.set_note("| table |")
+    tracked.set_description("| table |")
     assert run_of(tracked, store).data.tags["mlflow.note.content"] == "| table |"
     with TrackedRun.start(client, experiment_id, name="b", config={}, tags={}, folder=tmp_path / "b") as other:
         client.set_tag(other.run_id, "mlflow.note.content", "mine")
-        other.set_note("| table |")
+        other.set_description("| table |")
     assert client.get_run(other.run_id).data.tags["mlflow.note.content"] == "mine"
 
 
@@ -160,7 +160,7 @@ def test_description_of_a_grid_follows_its_table_unless_somebody_wrote_one(store
 def test_description_follows_a_result_that_changes(store, tmp_path):
     client, experiment_id = store()
     with TrackedRun.start(client, experiment_id, name="a", config={}, tags={}, folder=tmp_path) as first:
-        first.set_note("early")
+        first.set_description("early")
     with TrackedRun.open_existing(client, first.run_id, name="a", folder=tmp_path) as again:
-        again.set_note("late")
+        again.set_description("late")
     assert client.get_run(first.run_id).data.tags["mlflow.note.content"] == "late"

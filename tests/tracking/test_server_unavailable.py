@@ -14,10 +14,10 @@ from mlflow import MlflowClient
 
 from armscan.cli.main import main
 from armscan.errors import TrackingError, TrackingUnavailableError
-from armscan.tracking import TrackedRun, abandon, note_end, open_store, sync, upload_pending, uploader
-from armscan.tracking.client import reason_in, unavailable_reason
+from armscan.tracking import TrackedRun, fail_dead_runs, note_end, open_store, sync, upload_pending, uploader
 from armscan.tracking.notes import notes
 from armscan.tracking.outbox import file_of
+from armscan.tracking.tracking_store import reason_in, unavailable_reason
 from armscan.utils.files import cache_folder
 from tests.support.disks import small_disk
 from tests.support.mlflow_server import mlflow_server
@@ -271,7 +271,7 @@ def test_runs_of_a_dead_process_are_ended_and_those_of_a_living_one_are_not(open
     # As the system does with a killed process.
     dead._uploader._stopped.set()
     dead._outbox.close()
-    abandon(tmp_path, store, "its worker died")
+    fail_dead_runs(tmp_path, store, "its worker died")
     client = MlflowClient(server.uri)
     run = client.get_run(dead.run_id)
     assert (run.info.status, run.data.tags["failure"]) == ("FAILED", "its worker died")

@@ -32,7 +32,7 @@ from armscan.tracking.notes import NOTES_FOLDER, Note, notes
 from armscan.tracking.outbox import Address, Outbox, file_of
 from armscan.tracking.sanitize import flatten
 from armscan.tracking.sync import _upload_pending, sync
-from armscan.tracking.tags import NOTE_TAG, VERSION_TAG
+from armscan.tracking.tags import DESCRIPTION_TAG, VERSION_TAG
 from armscan.tracking.uploader import upload
 from armscan.training import EpochReport, TrainingResult
 from armscan.utils.processes import ProcessInfo
@@ -157,10 +157,10 @@ def test_description_of_a_person_stays_and_armscans_is_replaced(store):
         uploader.set_description(SimpleNamespace(get_run=client.get_run, log_batch=requests), run_id, text)
         # A description without its checksum would pass for a person's.
         assert requests.call_args.kwargs["tags"][0].value == text
-        assert client.get_run(run_id).data.tags[NOTE_TAG] == text
-    client.mlflow.set_tag(run_id, NOTE_TAG, "a person's")
+        assert client.get_run(run_id).data.tags[DESCRIPTION_TAG] == text
+    client.mlflow.set_tag(run_id, DESCRIPTION_TAG, "a person's")
     uploader.set_description(client.mlflow, run_id, "third")
-    assert client.get_run(run_id).data.tags[NOTE_TAG] == "a person's"
+    assert client.get_run(run_id).data.tags[DESCRIPTION_TAG] == "a person's"
 
 
 def test_tracked_run_keeps_a_folder_with_all_in_it_and_what_makes_it_a_model_last(store, tmp_path):

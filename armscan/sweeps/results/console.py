@@ -51,7 +51,7 @@ def print_result(opened: OpenedStudy) -> int:
         print(printable(f"error: {unfinished}"), file=sys.stderr)
         return os.EX_TEMPFAIL
     if scheduler.termination is not None and (ended := scheduler.termination.reason):
-        told = f"the study has ended by itself: {ended}; study.n_trials or study.terminator change that"
+        told = f"the study has ended early: {ended}; to continue it, change study.n_trials or study.terminator"
         print_sentence(printable(told))
     elif len(state.finished) < settings.n_trials and (limit := settings.limit_reason(state)):
         print_sentence(f"the search has ended: {limit}")

@@ -41,7 +41,7 @@ class ConfigResult:
     baselines: Mapping[str, MetricEstimates]
 
 
-def values_of(trial: FrozenTrial, objectives: Iterable[str]) -> str:
+def values_text(trial: FrozenTrial, objectives: Iterable[str]) -> str:
     """Return the values of a trial with the names of the objectives, as a string."""
     return ", ".join(f"{name} {value:.4g}" for name, value in zip(objectives, trial.values, strict=True))
 

@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from armscan.errors import ArmscanError, printable
-from armscan.sweeps.results.final_results import values_of
+from armscan.sweeps.results.final_results import values_text
 from armscan.sweeps.scheduling.population import searched_values
 from armscan.sweeps.scheduling.state import StudyState, is_feasible, seconds_of
 from armscan.sweeps.space.parameter import overrides_of
@@ -61,7 +61,7 @@ def progress_display(opened: OpenedStudy, folder: Path) -> Iterator[None]:
 
     search = opened.search
     print_sentence(f"study {search.name} in {search.scheduler.storage.uri}, run {search.run_id}")
-    print_sentence(f"the workers write into {folder}")
+    print_sentence(f"the workers write their logs to {folder}")
     thread = threading.Thread(target=show, daemon=True)
     thread.start()
     try:
@@ -138,7 +138,7 @@ def status_line(opened: OpenedStudy, state: StudyState) -> str:
         f"{len(state.running)} running, {len(state.failed)} failed, {len(state.retried)} retried",
     ]
     if best := best_trials(opened.search.scheduler.study, 1):
-        parts.append(f"best {values_of(best[0], settings.objectives)} (trial {best[0].number})")
+        parts.append(f"best {values_text(best[0], settings.objectives)} (trial {best[0].number})")
     durations = [seconds for trial in state.finished if (seconds := seconds_of(trial)) is not None]
     if durations and opened.search.scheduler.end_reason(state) is None:
         left_s = (settings.n_trials - len(state.finished)) * fmean(durations) / settings.workers
@@ -159,4 +159,4 @@ def _describe(trial: FrozenTrial, phase: Phase) -> str:
         how = "stopped" if STOP in attributes else "pruned"
         return f"{name} {how} after {attributes.get(ENV_STEPS)} environment steps [{tried}]"
     infeasible = "" if is_feasible(trial) else ", infeasible"
-    return f"{name} done{infeasible}: {values_of(trial, phase.objectives)}{f' [{tried}]' if tried else ''}"
+    return f"{name} done{infeasible}: {values_text(trial, phase.objectives)}{f' [{tried}]' if tried else ''}"

@@ -95,7 +95,7 @@ def _summary(study: optuna.Study, state: StudyState, best: Sequence[FrozenTrial]
         f"{f'{hours:.1f} hours' if hours >= 1 else f'{60 * hours:.1f} minutes'}."
     )
     if ended:
-        text += f" The study has ended by itself: {html.escape(ended)}."
+        text += f" The study has ended early: {html.escape(ended)}."
     if best:
         values = zip(objectives, best[0].values, strict=True)
         said = "; ".join(f"{title_of(name)} {value_text(name, value)}" for name, value in values)

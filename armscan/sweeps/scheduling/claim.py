@@ -14,8 +14,8 @@ T = TypeVar("T")
 class PendingWrites(list[Callable[[], object]]):
     """Short writes about a trial, sent with its next report, its outcome or its requeue.
 
-    Each is repeated if the storage became unavailable before it confirmed the write. One thread appends and flushes; a
-    requeue may write from another.
+    A write is repeated if the storage became unavailable before it confirmed it. The worker's thread appends and
+    flushes; another thread may call `write` when it requeues the trial.
     """
 
     def write(self) -> int:

@@ -19,7 +19,7 @@ from armscan.sweeps.storage.attribute_names import FINALIST, RUN, SCHEDULE
 from armscan.sweeps.study.final_eval import FinalEvaluation
 from armscan.sweeps.study.settings import StudySettings
 from armscan.sweeps.tasks.attempt import Attempt, trial_folder
-from armscan.tracking import TrackingStore, abandon
+from armscan.tracking import TrackingStore, fail_dead_runs
 from armscan.tracking.tags import FAILURE_TAG, STORAGE_TAG, STUDY_TAG, TRIAL_TAG
 from armscan.utils.run_files import LAST_CHECKPOINT
 
@@ -91,7 +91,7 @@ class Phase:
 
     def close_runs_of(self, trial: FrozenTrial) -> None:
         """Close the tracked runs that a dead worker has left open, except those that a retry has resumed."""
-        abandon(trial_folder(self.folder, trial.number), self.client, WORKER_DIED)
+        fail_dead_runs(trial_folder(self.folder, trial.number), self.client, WORKER_DIED)
 
     def close_orphaned_runs(self) -> None:
         """Close runs whose workers ended before the run's ID was stored in the trial or in the folder of a seed."""

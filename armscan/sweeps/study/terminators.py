@@ -111,7 +111,7 @@ class Stagnation:
         fronts = front_numbers(np.array([*new, *before]))
         if (fronts[: len(new)] == 0).any():
             return None
-        return f"the last {self._n_trials} of {len(trials)} trials were no better than those before"
+        return f"the last {self._n_trials} of {len(trials)} completed trials were no better than those before"
 
 
 def seed_noise(trials: Sequence[FrozenTrial], objective: str, direction: StudyDirection) -> float | None:

@@ -164,7 +164,7 @@ def _leaving(opened: OpenedStudy, folder: Path, tracked: TrackedRun, leave_s: fl
             metrics = best_metrics(opened.search.scheduler.study, judgement)
             tracked.log_metrics(metrics, n_env_steps=0, keeps_nan=has_changed)
             if note := result_note(judgement):
-                tracked.set_note(note)
+                tracked.set_description(note)
                 where = opened.search.client, opened.search.experiment_id, opened.search.run_id, opened.folder
                 note_run(opened.search.scheduler.study, *where, note)
         _upload(opened, tracked, "KILLED" if is_asked else status)

@@ -27,7 +27,7 @@ LAUNCHER_FILE, STOP_FILE, WORKER_FILES = "launcher.json", "stop", "worker-*.json
 LEFT, UNAVAILABLE, REFUSED = 130, 75, 65
 ENDS = (0, LEFT, UNAVAILABLE, REFUSED)
 GPUS, KEPT_GPUS, ALL_GPUS = "CUDA_VISIBLE_DEVICES", "ARMSCAN_GPUS", "all"
-# A worker that is killed again and again does no work; its trials have failed long before.
+# A worker that is killed again and again does no work; by then its trials have failed.
 MAX_RESTARTS = 100
 # One that crashes, and is not killed, will crash again.
 MAX_ERRORS = 5

@@ -56,7 +56,7 @@ def test_study_stagnates_exactly_where_each_of_the_last_trials_has_one_before_th
 def test_stagnation_follows_the_direction_and_says_so():
     study = study_of([(1.0,), (3.0,), (2.0,), (2.0,)], ["maximize"])
     assert reason_of(Stagnation(3), study) is None
-    assert reason_of(Stagnation(2), study) == "the last 2 of 4 trials were no better than those before"
+    assert reason_of(Stagnation(2), study) == "the last 2 of 4 completed trials were no better than those before"
 
 
 @pytest.mark.parametrize(("n_here", "is_over"), [(0, False), (1, False), (2, True)])
