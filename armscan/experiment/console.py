@@ -8,7 +8,6 @@ from pathlib import Path
 from rich.text import Text
 
 from armscan.config.command_hints import STARTED_IN, armscan_command
-from armscan.config.defaults import FOLD
 from armscan.experiment.job import INTERRUPTED, JobOutcome
 from armscan.experiment.results import TITLES
 from armscan.training import TEST, MetricEstimates, ResultTable
@@ -43,20 +42,22 @@ def print_result_table(
         print_sentence(f"result{of and f' ({of})'}: {table.headline}")
 
 
-def print_jobs(outcomes: Mapping[str, JobOutcome], run_ids: Mapping[str, str]) -> ResultTable:
+def print_jobs(outcomes: Mapping[str, JobOutcome], run_ids: Mapping[str, str], *, have_same_task: bool) -> ResultTable:
     """Print the table of a multirun's jobs, and return it.
 
     Args:
         outcomes: Outcome of each job, by its number.
         run_ids: MLflow run ID of each job that started a run, by its number.
+        have_same_task: Whether all jobs have the same task and test volumes; otherwise the best of them is the easiest,
+            and the table has no headline.
     """
-    table = jobs_table(outcomes, run_ids)
+    table = jobs_table(outcomes, run_ids, have_same_task=have_same_task)
     print_result_table(f"jobs ({TEST})", table)
     return table
 
 
-def jobs_table(outcomes: Mapping[str, JobOutcome], run_ids: Mapping[str, str]) -> ResultTable:
-    """Return the table of a multirun's jobs, with the baselines below them."""
+def jobs_table(outcomes: Mapping[str, JobOutcome], run_ids: Mapping[str, str], *, have_same_task: bool) -> ResultTable:
+    """Return the table of a multirun's jobs, with the baselines below them; see `print_jobs`."""
     figures = {
         number: {name: MetricEstimates.of_metrics(metrics) for name, metrics in outcome.metrics.items()}
         for number, outcome in outcomes.items()
@@ -77,12 +78,10 @@ def jobs_table(outcomes: Mapping[str, JobOutcome], run_ids: Mapping[str, str]) -
     n_baselines = len(results) - len(outcomes)
     names = {number: f"{number} ({outcome.varied})" for number, outcome in outcomes.items()}
     randoms = {names[number]: each[RANDOM] for number, each in baselines.items() if RANDOM in each}
-    # Folds have different volumes: the best of them is the easiest.
-    has_folds = any(f"{FOLD}=" in outcome.varied for outcome in outcomes.values())
     return ResultTable(
         results,
         {heading: [*values, *[""] * n_baselines] for heading, values in facts.items()},
-        "" if has_folds else headline({names[number]: each for number, each in tested.items()}, randoms),
+        headline({names[number]: each for number, each in tested.items()}, randoms) if have_same_task else "",
     )
 
 

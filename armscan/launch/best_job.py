@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from mlflow.entities import Metric, Param, Run, RunTag
 
-from armscan.config.defaults import FOLD
+from armscan.config.task import have_same_task
 from armscan.stats.on_plane import ON_PLANE_KEY, leading_of
 from armscan.tracking import TrackingStore
 from armscan.tracking.outbox import now_ms
@@ -16,8 +16,6 @@ from armscan.training.episode_results import TEST_METRICS
 from armscan.training.metric_display import leading_among
 
 TESTED = f"{TEST_METRICS}/"
-# Jobs that differ in one of these have different tasks or test volumes, so that none of them is the best.
-OF_TASK = ("projection", "data.path", FOLD)
 
 
 def best_of(runs: Sequence[Run]) -> Run | None:
@@ -41,7 +39,7 @@ def show_best(store: TrackingStore, parent_id: str, jobs: Sequence[Run]) -> None
     if (best := best_of(jobs)) is None:
         return
     limits = [Param(name, value) for name, value in best.data.params.items() if name == ON_PLANE_KEY]
-    if len({tuple(job.data.params.get(key) for key in OF_TASK) for job in jobs}) > 1:
+    if not have_same_task(job.data.params for job in jobs):
         store.log_batch(parent_id, params=limits)
         return
     now, metrics = now_ms(), []

@@ -21,6 +21,7 @@ from armscan.config.command_hints import armscan_command, resume_command, run_co
 from armscan.config.credentials import check_address
 from armscan.config.defaults import FOLD, TRACKING_URI, to_plain
 from armscan.config.error_messages import one_line_message
+from armscan.config.task import have_same_task
 from armscan.config.trust import needs_trust, untrusted_word
 from armscan.errors import InvalidValueError, TrackingError
 from armscan.experiment.job import (
@@ -160,7 +161,8 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
     if outcomes:
         from armscan.experiment.console import print_jobs, print_where_to_look
 
-        table = print_jobs(outcomes, {run.data.tags[JOB_TAG]: run.info.run_id for run in runs})
+        run_ids = {run.data.tags[JOB_TAG]: run.info.run_id for run in runs}
+        table = print_jobs(outcomes, run_ids, have_same_task=have_same_task(run.data.params for run in runs))
         if store is not None and runs:
             _keep_tables(table, folder, parent, outcomes, runs, store)
             print_where_to_look(folder, parent["tracking"]["uri"], files=(RESULTS_PAGE, ""))

@@ -86,10 +86,11 @@ def write_comparison(groups: Sequence[Group], left_out: Sequence[TrackedTraining
     final = final_table(groups, reached)
     tables = all_numbers(groups, curves, reached, pairs)
     titles = validation_titles(figures)
+    has_other_volumes = any(each.probability is None for each in pairs["on_plane_rate"])
     parts = [
         f"<p><strong>{html.escape(final.headline)}</strong></p>" if final.headline else "",
         _summary(groups),
-        notes_on(groups, left_out, has_other_volumes=any(each.probability is None for each in pairs["on_plane_rate"])),
+        notes_on(groups, left_out, curves, has_other_volumes=has_other_volumes),
         *_learning(groups, curves),
         *_final(groups, reached, replace(final, headline="")),
         *_better(groups, pairs),
@@ -121,7 +122,12 @@ def _summary(groups: Sequence[Group]) -> str:
         for group, colour in zip(groups, colours(len(groups)), strict=True)
     ]
     runs = f"{counted(n_trainings, 'run')} in {counted(len(groups), 'group')}"
-    same = "" if all(group.has_same_volumes for group in groups) else ", except for their volumes"
+    others = {
+        "their volumes": any(not group.has_same_volumes for group in groups),
+        "armscan's version": any(len(group.commits) > 1 for group in groups),
+    }
+    but = " and ".join(name for name, differs in others.items() if differs)
+    same = f", except for {but}" if but else ""
     return f"<p>{runs}: those of a group differ by nothing but {by}{same}.</p>{table(rows, what='groups')}"
 
 
@@ -189,7 +195,9 @@ def _better(groups: Sequence[Group], pairs: Mapping[str, Sequence[Pair]]) -> Ite
         heading = f"By {LEADING if figure == 'on_plane_rate' else title_of(figure)}: "
         heading += f"{'higher' if COMPARED_BY[figure] else 'lower'} is better"
         matrices.append(f"<div><h3>{heading}</h3>{_matrix(groups, of_figure)}</div>")
-    drawn = f'<p>{HOW_BETTER}</p><div class="matrices">{"".join(matrices)}</div>'
+    n_pairs = max(sum(each.probability is not None for each in of_figure) for of_figure in pairs.values())
+    by_chance = f"Of {counted(n_pairs, 'pair')}, {0.05 * n_pairs:.2g} would be bold by chance if all groups were alike."
+    drawn = f'<p>{HOW_BETTER} {by_chance}</p><div class="matrices">{"".join(matrices)}</div>'
     yield drawn if len(groups) <= MANY_PAIRS else folded(f"Each of {len(groups)} groups against each other", drawn)
 
 

@@ -47,14 +47,15 @@ def curve_of(group: Group, figure: str, axis: str) -> Curve | None:
     """Return the curve of a group over one of `AXES`; None if none of its trainings has measured the metric.
 
     Values are interpolated linearly between validations. A training that has ended keeps its last value while others of
-    its group continue. If one was cut off, the curve ends there. It begins where all have measured a value.
+    its group continue. Where one was cut off, or its metric became NaN, the curve ends. It begins where all have
+    measured a value.
     """
     trainings = of_common_folds(training for training in group.trainings if figure in training.series)
     lines = [_line(training.series[figure], axis) for training in trainings]
     known = [(training, line) for training, line in zip(trainings, lines, strict=True) if len(line[0])]
     if not known:
         return None
-    places = _places(known)
+    places = _places(known, axis)
     of_seeds: dict[str, list[FloatArray]] = defaultdict(list)
     for training, line in known:
         of_seeds[training.seed_key].append(np.interp(places, *line))
@@ -70,10 +71,19 @@ def _line(series: Series, axis: str) -> tuple[FloatArray, FloatArray]:
     return places[is_known], series.values[is_known]
 
 
-def _places(known: Sequence[tuple[TrackedTraining, tuple[FloatArray, FloatArray]]]) -> FloatArray:
+def _is_kept(training: TrackedTraining, end: float, axis: str) -> bool:
+    """Return whether a metric that ends here keeps its last value: the training was whole, and measured it to its end.
+
+    NaN, as of a diverged training, is not tracked.
+    """
+    ends = [AXES[axis](series)[-1] for series in training.series.values()]
+    return training.is_whole and end >= np.nanmax(ends)
+
+
+def _places(known: Sequence[tuple[TrackedTraining, tuple[FloatArray, FloatArray]]], axis: str) -> FloatArray:
     first = max(line[0][0] for _, line in known)
     last = max(line[0][-1] for _, line in known)
-    last = min([last, *(line[0][-1] for training, line in known if not training.is_whole)])
+    last = min([last, *(line[0][-1] for training, line in known if not _is_kept(training, line[0][-1], axis))])
     places = np.unique(np.concatenate([line[0] for _, line in known]))
     places = places[(places >= first) & (places <= last)]
     return places if len(places) <= MAX_POINTS else np.linspace(places[0], places[-1], MAX_POINTS)

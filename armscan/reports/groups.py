@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from armscan.config.defaults import ADDED, FOLD, NOT_COMPARED
+from armscan.config.task import is_under, rules_in
 from armscan.reports.load import TrackedTraining
 
 LEFT_OUT = (*NOT_COMPARED, "data.cache_dir", FOLD)
@@ -17,10 +18,6 @@ MAX_LABEL_CHARS = 72
 SECTIONS = re.compile(r"[\w.]+\.(?=\w+=)")
 # A number with more digits than a label has room for.
 LONG_NUMBER = re.compile(r"(?<==)\d+\.\d{5,}(e[-+]?\d+)?")
-# Keys that change the task of an episode, or how it is judged.
-RULES = ("projection", "reward", "env.")
-# What an agent sees of an episode: the task stays the same.
-SEEN = ("env.observation", "env.stack", "env.stack_exclude", "env.stack_memory", "env.memory", "env.flat")
 
 
 @dataclass(frozen=True)
@@ -59,6 +56,11 @@ class Group:
         """Whether all of its trainings had the same volumes, or those of their fold, as far as that is known."""
         of_fold = {training.fold: training.volumes for training in self.trainings if training.volumes is not None}
         return all(training.volumes in (None, of_fold.get(training.fold)) for training in self.trainings)
+
+    @property
+    def commits(self) -> set[str]:
+        """Commits of armscan that its trainings ran, as far as they are known."""
+        return {training.commit for training in self.trainings if training.commit is not None}
 
     @property
     def title(self) -> str:
@@ -108,13 +110,7 @@ def of_common_folds(trainings: Iterable[TrackedTraining]) -> list[TrackedTrainin
 
 def differing_rules(groups: Sequence[Group]) -> list[str]:
     """Return the keys, apart from the agent's and its observations', in which the groups' episodes differ."""
-    params = [_compared(group.trainings[0].params) for group in groups]
-    return _differing(
-        [
-            {key: value for key, value in each.items() if key.startswith(RULES) and not _is_under(key, SEEN)}
-            for each in params
-        ]
-    )
+    return _differing([rules_in(_compared(group.trainings[0].params)) for group in groups])
 
 
 def _one_for_each_seed(trainings: Iterable[TrackedTraining]) -> list[TrackedTraining]:
@@ -125,12 +121,8 @@ def _one_for_each_seed(trainings: Iterable[TrackedTraining]) -> list[TrackedTrai
 
 
 def _compared(params: Mapping[str, str]) -> dict[str, str]:
-    kept = {key: value for key, value in params.items() if not _is_under(key, LEFT_OUT)}
+    kept = {key: value for key, value in params.items() if not is_under(key, LEFT_OUT)}
     return {key: value for key, value in kept.items() if key not in ADDED or value != str(None)}
-
-
-def _is_under(key: str, sections: Iterable[str]) -> bool:
-    return any(key == each or key.startswith(f"{each}.") for each in sections)
 
 
 def _differing(of_groups: Sequence[Mapping[str, str]]) -> list[str]:

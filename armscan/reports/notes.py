@@ -6,24 +6,37 @@ import html
 from collections.abc import Iterator, Sequence
 
 from armscan.config.defaults import FOLDS
+from armscan.reports.charts import Curves
 from armscan.reports.groups import Group, differing_rules
-from armscan.reports.load import TrackedTraining
+from armscan.reports.load import TrackedTraining, validation_titles
 from armscan.reports.significance import evaluations_by_seed
 from armscan.stats.aggregation import MIN_SEEDS
 from armscan.training.headline import MIN_WRISTS
+from armscan.utils.run_files import ID_CHARS
 
 # From this number of seeds on, the intervals of final figures are nearly as wide as they should be.
 MANY_SEEDS = 5
 
 
-def notes_on(groups: Sequence[Group], left_out: Sequence[TrackedTraining], *, has_other_volumes: bool) -> str:
-    """Return the notes as a list, nothing if there are none; `left_out` are trainings that repeat another one."""
+def notes_on(
+    groups: Sequence[Group], left_out: Sequence[TrackedTraining], curves: Curves, *, has_other_volumes: bool
+) -> str:
+    """Return the notes as a list, nothing if there are none.
+
+    Args:
+        groups: Groups to compare.
+        left_out: Trainings that repeat another one.
+        curves: Learning curves of the groups.
+        has_other_volumes: Whether some groups were tested on other volumes than others.
+    """
     notes = [
         *_on_folds(groups),
         *_on_seeds(groups),
         *_on_wrists(groups),
         *_on_unfinished(groups),
         *_on_missing(groups),
+        *_on_curves(groups, curves),
+        *_on_commits(groups),
         *_on_volumes(groups),
         *_on_rules(groups, has_other_volumes=has_other_volumes),
     ]
@@ -92,6 +105,24 @@ def _on_missing(groups: Sequence[Group]) -> Iterator[str]:
                 of_files.setdefault(file, []).append(_named(group, training))
     for file, which in of_files.items():
         yield f"No {file} is among the artifacts of {'; '.join(which)}."
+
+
+def _on_curves(groups: Sequence[Group], curves: Curves) -> Iterator[str]:
+    titles = validation_titles(figure for figure, *_ in curves)
+    n_of = {(figure, number): curve.n_seeds for (figure, _, number), curve in curves.items() if figure in titles}
+    for (figure, number), n_seeds in n_of.items():
+        if n_seeds < groups[number].n_seeds:
+            yield (
+                f"Group {groups[number].number}: the curve of {titles[figure]} is over {n_seeds} of its "
+                f"{groups[number].n_seeds} seeds, because the others have not tracked it."
+            )
+
+
+def _on_commits(groups: Sequence[Group]) -> Iterator[str]:
+    for group in groups:
+        if len(group.commits) > 1:
+            commits = ", ".join(sorted(commit[:ID_CHARS] for commit in group.commits))
+            yield f"Group {group.number}: its runs are of different versions of armscan: {commits}."
 
 
 def _on_volumes(groups: Sequence[Group]) -> Iterator[str]:

@@ -103,7 +103,8 @@ def estimates(
     """Return figures with their intervals, by name; all from the same resamples, which are the same every time.
 
     Args:
-        columns: Statistic and values of each figure, by its name; one value for each episode, NaN to leave it out.
+        columns: Statistic and values of each figure, by its name; one value for each episode, NaN to leave it out. A
+            figure measured in one episode alone, or on one of several subjects, has no interval.
         subjects: Subject of each episode's volume.
         trainings: Training of each episode. Default: None, all are from one.
 
@@ -120,10 +121,15 @@ def estimates(
         for name, (statistic, _) in columns.items():
             # Index -1, an unused place, reads the NaN that is appended here.
             resampled[name].append(statistic(np.append(arrays[name], np.nan)[places]))
-    return {
-        name: _estimate(float(statistic(arrays[name])), np.concatenate(resampled[name]))
-        for name, (statistic, _) in columns.items()
-    }
+    found = {}
+    for name, (statistic, _) in columns.items():
+        value, is_known = float(statistic(arrays[name])), np.isfinite(arrays[name])
+        measured = {subject for subject, known in zip(subjects, is_known, strict=True) if known}
+        # One episode, or one subject of several, says nothing about others.
+        is_single = is_known.sum() < 2 or len(measured) < min(2, len(set(subjects)))
+        of_name = np.empty(0) if is_single else np.concatenate(resampled[name])
+        found[name] = _estimate(value, of_name)
+    return found
 
 
 @cache

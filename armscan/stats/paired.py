@@ -77,6 +77,20 @@ def of_subjects(values: FloatArray, subjects: Sequence[str]) -> FloatArray:
     return np.asarray(centre + (values - centre) @ np.eye(n_subjects)[number_of] * n_subjects / n_volumes)
 
 
+def weighted_by_volume(values: FloatArray, weights: FloatArray) -> FloatArray:
+    """Return values whose plain mean is the weighted mean of these, linearised as `of_subjects` does.
+
+    Args:
+        values: Values, shape (..., seeds, volumes).
+        weights: Weight of each volume, 1 on average, shape (volumes,).
+    """
+    # Unchanged to the last bit: the product below would round.
+    if (weights == 1.0).all():
+        return values
+    centre = (values * weights).mean(axis=(-2, -1), keepdims=True)
+    return np.asarray(centre + (values - centre) * weights)
+
+
 def crossed_mean(values: FloatArray) -> tuple[Any, Any]:
     """Return means over seeds and volumes, and half the widths of their 95 % intervals.
 
@@ -102,6 +116,8 @@ def crossed_mean(values: FloatArray) -> tuple[Any, Any]:
     # Each mean square contains the residual's once; if the volumes' is no larger, they do not differ.
     differ = volumes > rest if n_seeds > 1 else np.full(means.shape, True)
     variances = np.maximum(seeds + np.where(differ, volumes - rest, 0.0), volumes)
+    # Seeds and volumes can have equal means although their values differ.
+    variances = np.where(variances > 0.0, variances, rest)
     terms = seeds**2 / max(1, n_seeds - 1) + np.where(differ, volumes**2 / max(1, n_volumes - 1), 0.0)
     # Without any of these spreads, their degrees of freedom limit nothing.
     df = np.where(terms > 0.0, variances**2 / np.where(terms > 0.0, terms, 1.0), np.inf)

@@ -8,13 +8,14 @@ If the difference is the same on all wrists, the interval is Newcombe's, which t
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from armscan.stats.bootstrap import Estimate, difference_of_rates, wilson
-from armscan.stats.paired import crossed_mean, of_subjects
+from armscan.stats.paired import crossed_mean, of_subjects, weighted_by_volume
 from armscan.training.episode_results import Evaluation, subject_of_volumes
 from armscan.training.metric_display import interval_text
 from armscan.training.metrics import MetricEstimates
@@ -49,7 +50,11 @@ def beside_random(
     scores = np.array([[each[name] for name in theirs] for each in ours])
     assert random is not None
     subject_of = subject_of_volumes([random, *trainings])
-    differences = of_subjects(scores - np.array([*theirs.values()]), [subject_of[name] for name in theirs])
+    # As the rates do, the difference gives a volume the weight of its episodes.
+    n_episodes = Counter(episode.volume for each in trainings for episode in each.episodes)
+    weights = np.array([n_episodes[name] for name in theirs]) / np.mean([*n_episodes.values()])
+    weighted = weighted_by_volume(scores - np.array([*theirs.values()]), weights)
+    differences = of_subjects(weighted, [subject_of[name] for name in theirs])
     mean, half = crossed_mean(differences)
     above = Estimate.around(mean, half).clipped(-1.0, 1.0)
     if half < NO_WIDTH:
@@ -66,12 +71,14 @@ def headline(results: Mapping[str, MetricEstimates], randoms: Mapping[str, Metri
 
     Returns:
         Sentences such as `On plane, 5 mm 10°: agent 73.5% (61.0–85.0), random 56.5% (46.0–66.5). Better than random:
-        +17.0 points (+2.3 to +31.7). Median distance 2.7 mm (2.0–3.4), 0.0°.`; empty if no result has the rate.
+        +17.0 points (+2.3 to +31.7). Median distance 2.7 mm (2.0–3.4), 0.0°.`; empty if no result has the rate, or
+        their leading limits differ.
     """
-    limits = next((each.on_plane[0] for each in results.values() if each.on_plane), None)
-    known = {name: each for name, each in results.items() if limits and limits.metric in each.estimates}
-    if limits is None or not known:
+    known = {name: each for name, each in results.items() if each.on_plane}
+    # Rates within different limits cannot be compared.
+    if len({each.on_plane[0] for each in known.values()}) != 1:
         return ""
+    limits = next(each.on_plane[0] for each in known.values())
     name = max(known, key=lambda each: known[each].estimates[limits.metric].value)
     best, random = known[name], randoms.get(name)
     # The highest of several is optimistically biased.

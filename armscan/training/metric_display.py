@@ -40,6 +40,7 @@ QUANTITIES = (
     Quantity("median_expected_deg", "expected error °, median", "{:.1f}"),
     Quantity("median_nerve_area_error_mm2", "nerve area error mm², median", "{:.2f}"),
     Quantity("median_nerve_area_error_percent", "nerve area error %, median", "{:.1f}"),
+    Quantity("nerve_shown_rate", "nerve on labelled plane", "{:.1%}"),
     Quantity("success_rate", "success, by reward", "{:.1%}"),
     Quantity("mean_steps", "steps, mean", "{:.2f}"),
     Quantity("iqm_steps", "steps, IQM", "{:.2f}"),
@@ -80,7 +81,7 @@ def title_of(metric: str) -> str:
 
 def is_rate(metric: str) -> bool:
     """Return whether a metric is a share of episodes."""
-    return "success_rate" in metric or bool(limits_among([metric.rpartition("/")[2]]))
+    return metric.endswith(("success_rate", "nerve_shown_rate")) or bool(limits_among([metric.rpartition("/")[2]]))
 
 
 def bounds_of(metric: str) -> tuple[float, float]:

@@ -23,6 +23,8 @@ ENDS = ("_low", "_high")
 COUNTS = ("volumes", "subjects", "episodes", "episodes_started_solved")
 # Tracked if there are several.
 SEEDS = "seeds"
+# Only where it is below 1: the share of episodes whose labelled plane shows the nerve.
+NERVE_ERROR, NERVE_SHOWN = "nerve_area_error_mm2", "nerve_shown_rate"
 MEDIAN, P90, P95 = quantile(0.5), quantile(0.9), quantile(0.95)
 
 # Metrics by name: the statistic, and the value of an episode that it summarises.
@@ -86,6 +88,8 @@ class MetricEstimates:
             # Skip what was never measured.
             if any(each is not None for each in measured):
                 columns[name] = statistic, [math.nan if each is None else float(each) for each in measured]
+                if None in measured and value == NERVE_ERROR:
+                    columns[NERVE_SHOWN] = mean, [float(each is not None) for each in measured]
         columns |= _by_expected_error(episodes)
         for name, (statistic, values) in list(columns.items()):
             columns[name + NOT_STARTED_SOLVED] = statistic, np.where(is_other, values, math.nan).tolist()
@@ -132,7 +136,7 @@ class MetricEstimates:
     def estimate(self, name: str) -> Estimate:
         """Return a figure as it is shown: NaN if there is none; with Wilson's interval if its own has no width."""
         estimate = self.estimates.get(name, UNKNOWN)
-        return self.estimates.get(name + WILSON, estimate) if estimate.low == estimate.high else estimate
+        return estimate if estimate.low < estimate.high else self.estimates.get(name + WILSON, estimate)
 
     def metrics(self) -> dict[str, float]:
         """Return all numbers by name as they are shown, the ends of an interval as `..._low` and `..._high`."""

@@ -169,7 +169,7 @@ def test_page_and_description_of_all_folds_say_what_is_missing(tmp_path, databas
     store, experiment_id = store_in(tmp_path, "a")
     run_id = store.create_run(experiment_id, name="grid", tags={}).info.run_id
     table = table_of([(left_by_a_run(tmp_path / "a", "wrist", [1.0]), "data.fold=0")])
-    jobs = jobs_table({"1": JobOutcome("", "data.fold=1", failure="out of memory")}, {})
+    jobs = jobs_table({"1": JobOutcome("", "data.fold=1", failure="out of memory")}, {}, have_same_task=False)
     keep_table(table, jobs, tmp_path, store, run_id, ["1 of 2 jobs are missing"])
     shown = (tmp_path / RESULTS_PAGE).read_text()
     assert "<p>1 of 2 jobs are missing</p>" in shown
@@ -184,9 +184,11 @@ def test_no_job_is_the_best_of_those_that_are_tested_on_other_wrists():
         str(fold): JobOutcome("", f"data.fold={fold}", metrics={TEST: {"on_plane_5mm_10deg": rate}})
         for fold, rate in enumerate((0.3, 0.9))
     }
-    assert jobs_table(outcomes, {}).headline == ""
+    assert jobs_table(outcomes, {}, have_same_task=False).headline == ""
     others = {number: replace(each, varied=f"agent={number}") for number, each in outcomes.items()}
-    assert "best of 2, chosen on these volumes: 1 (agent=1), 90.0%" in jobs_table(others, {}).headline
+    assert (
+        "best of 2, chosen on these volumes: 1 (agent=1), 90.0%" in jobs_table(others, {}, have_same_task=True).headline
+    )
 
 
 def test_table_keeps_kinds_of_runs_apart_and_a_grid_without_folds_has_none(tmp_path):

@@ -187,6 +187,28 @@ def test_runs_of_a_group_that_had_other_volumes_are_told(written, make_training,
     assert "differ by nothing but the seed." in page
 
 
+def test_curve_of_some_seeds_alone_is_told(written, make_training):
+    without = make_training(2)
+    del without.series["validation/mean_steps"]
+    page, _ = written(make_training(0), make_training(1), without)
+    assert "Group 1: the curve of steps, mean is over 2 of its 3 seeds" in page
+    page, _ = written(make_training(0), make_training(1))
+    assert "the curve of steps" not in page
+
+
+def test_runs_of_a_group_that_ran_other_code_are_told(written, make_training):
+    page, _ = written(*(make_training(seed, commit=commit) for seed, commit in enumerate(("0123456789", "abcdef0123"))))
+    assert "Group 1: its runs are of different versions of armscan: 01234567, abcdef01." in page
+    assert "differ by nothing but the seed, except for armscan's version." in page
+    page, _ = written(make_training(0, commit="0123456789"), make_training(1, commit=None))
+    assert "versions of armscan" not in page
+
+
+def test_pairs_that_chance_alone_sets_in_bold_are_counted(written, make_training):
+    page, _ = written(*(make_training(seed, params={"agent.lr": str(lr)}) for lr in range(5) for seed in range(2)))
+    assert "Of 10 pairs, 0.5 would be bold by chance if all groups were alike." in page
+
+
 def test_figures_of_one_evaluation_are_of_all_its_episodes(make_training):
     episodes = [make_episode("a", 2), make_episode("b", 2), make_episode("b", 8)]
     (group,), _ = group_trainings([make_training(evaluation=Evaluation(tuple(episodes)))])

@@ -40,6 +40,12 @@ def test_the_curve_ends_with_a_training_that_has_not_run_to_its_end(make_trainin
     assert curve(cut, late).places.tolist() == [100, 200]
 
 
+def test_the_curve_ends_where_a_metric_of_a_training_became_nan(make_training):
+    diverged = make_training(0, steps=(100, 200, 300), values=(10.0, np.nan, np.nan))
+    diverged.series[RATE] = make_training(0, steps=(100, 200, 300), values=(0.0, 0.5, 1.0)).series[RATE]
+    assert curve(diverged, make_training(1, steps=(100, 200, 300), values=(10.0, 8.0, 6.0))).places.tolist() == [100]
+
+
 def test_the_curve_begins_where_all_are_known_and_is_straight_between_validations(make_training):
     ours = curve(
         make_training(0, steps=(100, 300), values=(0.0, 2.0)), make_training(1, steps=(200, 300), values=(5.0, 5.0))

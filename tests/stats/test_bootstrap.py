@@ -128,13 +128,23 @@ def test_volumes_that_a_training_has_not_met_are_left_out():
     assert ours == (2.0, 1.0, 3.0)
 
 
-@given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 3), st.floats(-5, 5)), min_size=1, max_size=30))
+@given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 3), st.floats(-5, 5)), min_size=2, max_size=30))
 @settings(max_examples=40)
 def test_intervals_lie_within_what_was_measured(episodes):
     trainings, volumes, values = zip(*episodes, strict=True)
     ours = estimates({"m": (mean, values)}, volumes, trainings=trainings)["m"]
     assert min(values) - 1e-9 <= ours.low <= ours.high <= max(values) + 1e-9
     assert ours.value == pytest.approx(np.mean(values), abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    "values", [[2.0, np.nan, np.nan], [2.0, 3.0, np.nan]], ids=["one episode", "one of two wrists"]
+)
+def test_figure_of_one_episode_or_one_of_several_wrists_has_no_interval(values):
+    figures = estimates({"m": (mean, values), "all": (mean, [1.0, 2.0, 3.0])}, ["a", "a", "b"])
+    assert np.isnan(figures["m"][1:]).all()
+    assert figures["m"].value == np.nanmean(values)
+    assert figures["all"].low < figures["all"].high
 
 
 def test_trainings_must_be_as_many_as_episodes():

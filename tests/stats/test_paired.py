@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from armscan.errors import InvalidValueError
-from armscan.stats.paired import crossed_mean, of_subjects, paired_difference
+from armscan.stats.paired import crossed_mean, of_subjects, paired_difference, weighted_by_volume
 
 N_STUDIES = 4000
 
@@ -70,6 +72,23 @@ def test_interval_of_seeds_with_equal_means_is_hardly_wider_than_of_nearly_equal
     nearly = scores + np.array([[0.0], [1e-6]])
     halves = [crossed_mean(each)[1] for each in (scores, nearly)]
     assert halves[0] == pytest.approx(halves[1], rel=0.01)
+
+
+def test_differences_whose_means_are_equal_by_chance_have_an_interval():
+    differences = np.array([[0.5, 0.1], [0.1, 0.5]])
+    value, low, high = paired_difference(differences, np.zeros((2, 2)))
+    assert (value, high - value) == pytest.approx((0.3, value - low))
+    assert low < value
+
+
+@given(st.data())
+@settings(max_examples=30)
+def test_weighted_values_have_the_weighted_mean(data):
+    n = data.draw(st.integers(1, 6))
+    counts = np.array(data.draw(st.lists(st.integers(1, 9), min_size=n, max_size=n)))
+    values = np.array(data.draw(st.lists(st.lists(st.floats(-5, 5), min_size=n, max_size=n), min_size=2, max_size=2)))
+    weighted = weighted_by_volume(values, counts / counts.mean())
+    assert weighted.mean() == pytest.approx(np.average(values, axis=1, weights=counts).mean(), abs=1e-9)
 
 
 def test_trainings_of_other_seeds_or_volumes_are_refused():

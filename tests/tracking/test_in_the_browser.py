@@ -72,7 +72,7 @@ def test_run_of_a_grid_shows_the_figures_of_its_best_job(store):
     assert run.data.tags[BEST_TAG] == jobs[1]
 
 
-@pytest.mark.parametrize("key", ["data.fold", "projection", "data.path"])
+@pytest.mark.parametrize("key", ["data.fold", "projection", "data.path", "data.version", "env.transform.ty_mm"])
 def test_run_of_a_grid_over_tasks_shows_no_best_job(store, key):
     client, experiment_id = store()
     parent, *jobs = (client.create_run(experiment_id, name=name, tags={}).info.run_id for name in ("parent", "a", "b"))

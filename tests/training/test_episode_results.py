@@ -92,6 +92,9 @@ def test_episode_says_how_far_the_nerves_area_is_from_that_on_the_optimal_plane(
     assert episode.nerve_area_error_percent == pytest.approx(100 * abs(areas[0] - areas[1]) / areas[1])
     figures = MetricEstimates.of(Evaluation((episode, replace(episode, nerve_area_error_mm2=None))))
     assert figures.estimate("median_nerve_area_error_mm2").value == pytest.approx(episode.nerve_area_error_mm2)
+    # The table says that these are not all episodes.
+    assert figures.estimate("nerve_shown_rate").value == 0.5
+    assert "nerve on labelled plane" in [column.title for column in ResultTable({"agent": figures}).quantities]
 
 
 def test_nerve_is_not_available_where_volumes_have_none(phantom):

@@ -5,6 +5,7 @@ import pytest
 from scipy import stats
 
 from armscan.stats.bootstrap import difference_of_rates, wilson
+from armscan.stats.on_plane import ON_PLANE
 from armscan.training import Evaluation, MetricEstimates, ResultTable
 from armscan.training.headline import ABOVE_RANDOM, beside_random, headline
 from tests.training.test_train import episode_of
@@ -78,6 +79,23 @@ def test_best_of_several_results_is_named():
         name: MetricEstimates.of(evaluation([rate, rate])) for name, rate in (("0 (a=1)", 0.3), ("1 (a=2)", 0.7))
     }
     assert headline(figures, {}).startswith("On plane, 5 mm 10°: best of 2, chosen on these volumes: 1 (a=2), 70.0% (")
+
+
+def test_results_within_different_limits_have_no_headline():
+    figures = [
+        MetricEstimates.of(Evaluation(evaluation([0.5, 0.6]).episodes, limits)) for limits in (ON_PLANE, ON_PLANE[::-1])
+    ]
+    assert headline({"a": figures[0]}, {}) != "" != headline({"b": figures[1]}, {})
+    assert headline(dict(zip("ab", figures, strict=True)), {}) == ""
+
+
+def test_difference_is_that_of_the_rates_though_volumes_have_unequal_numbers_of_episodes():
+    ours, random = (
+        Evaluation((*evaluation(rates, n=2).episodes, *evaluation(rates[:1], n=4).episodes))
+        for rates in ([1.0, 0.5, 1.0], [0.5, 1.0, 0.5])
+    )
+    above = beside_random(MetricEstimates.of(ours), [ours], random).estimates[ABOVE_RANDOM]
+    assert above.value == pytest.approx(ours.on_plane_rate - random.on_plane_rate)
 
 
 def test_results_without_the_rate_have_no_headline():

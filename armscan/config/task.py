@@ -1,0 +1,31 @@
+"""Keys of a configuration that make up the task of an episode, and the volumes that an agent is tested on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+RULES = ("projection", "reward", "env")
+# What an agent sees of an episode: the task stays the same.
+SEEN = ("env.observation", "env.stack", "env.stack_exclude", "env.stack_memory", "env.memory", "env.flat")
+# Keys of the data that leave the test volumes as they are.
+NOT_TESTED_ON = ("data.cache_dir", "data.n_training")
+
+
+def is_under(key: str, sections: Iterable[str]) -> bool:
+    """Return whether a dotted key is one of some keys, or in one of these sections."""
+    return any(key == each or key.startswith(f"{each}.") for each in sections)
+
+
+def rules_in(params: Mapping[str, str]) -> dict[str, str]:
+    """Return the parameters that make up the task of an episode, or how it is judged."""
+    return {key: value for key, value in params.items() if is_under(key, RULES) and not is_under(key, SEEN)}
+
+
+def have_same_task(params: Iterable[Mapping[str, str]]) -> bool:
+    """Return whether the parameters of all runs name the same task on the same test volumes."""
+    tasks = [
+        rules_in(each)
+        | {key: value for key, value in each.items() if is_under(key, ("data",)) and key not in NOT_TESTED_ON}
+        for each in params
+    ]
+    return all(task == tasks[0] for task in tasks)
