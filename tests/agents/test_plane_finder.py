@@ -301,3 +301,23 @@ def test_places_of_earlier_looks_are_computed_in_32_bits_beside_mixed_precision(
     geometry = module.geometry.to("cpu", torch.float32)
     planes = geometry.planes(torch.as_tensor(observation["action"][None], dtype=torch.float32))
     torch.testing.assert_close(seen[0], module.network.earlier_places(planes, geometry))
+
+
+def test_every_update_teaches_episodes_of_its_own(phantom, monkeypatch):
+    learner, _ = made(phantom)
+    seen, teach = [], learner._teach
+
+    def recorded(*arguments):
+        seen.append(learner._optima(learner._envs))
+        return teach(*arguments)
+
+    monkeypatch.setattr(learner, "_teach", recorded)
+    learner.learn(24)
+    assert len(seen) > 1
+    assert not torch.equal(seen[0], seen[1])
+
+
+def test_learning_rate_comes_down_to_its_end(phantom):
+    learner, _ = made(phantom, lr=1e-2, lr_end_factor=0.1)
+    learner.learn(480)
+    assert all(group["lr"] < 2e-3 for group in learner._lr_groups())

@@ -6,7 +6,8 @@ import pytest
 
 from armscan.reports.comparison import write_comparison
 from armscan.reports.groups import group_trainings
-from armscan.reports.significance import baseline_metrics, compare_groups, final_metrics, have_same_volumes
+from armscan.reports.significance import baseline_metrics, compare_groups, complement, final_metrics, have_same_volumes
+from armscan.stats.bootstrap import Estimate
 from armscan.training import Evaluation
 from tests.reports.conftest import make_episode, rows
 
@@ -53,6 +54,31 @@ def test_fewer_steps_are_better_and_equal_ones_are_no_difference(make_training):
     assert {names: probability.value for names, probability in pairs.items()} == {(0, 1): 1.0, (0, 2): 0.5, (1, 2): 0.0}
     assert 0.5 < pairs[0, 1].low < pairs[0, 1].high == 1.0
     assert pairs[0, 2].low < 0.5 < pairs[0, 2].high
+
+
+@pytest.mark.parametrize("figure", ["on_plane_rate", "median_distance_mm"])
+def test_planes_nearer_to_the_labelled_one_are_better(make_training, figure):
+    trainings = [
+        make_training(seed, params={"agent.lr": str(lr)}, mean_steps=steps)
+        for lr, steps in ((1, 2), (2, 9))
+        for seed in range(2)
+    ]
+    (pair,) = compare_groups(group_trainings(trainings)[0])[figure]
+    assert pair.probability.value == 1.0
+
+
+def test_probability_of_the_other_side_has_its_ends_in_order():
+    assert complement(Estimate(0.75, 0.5, 1.0)) == (0.25, 0.0, 0.5)
+
+
+def test_group_whose_seeds_were_tested_on_different_volumes_is_not_compared(make_training):
+    usual = [make_training(seed, params={"agent.lr": "1"}) for seed in range(2)]
+    mixed = [
+        make_training(seed, params={"agent.lr": "2"}, evaluation=Evaluation((make_episode(f"v{seed}", 1),)))
+        for seed in range(2)
+    ]
+    (pair,) = compare_groups(group_trainings([*usual, *mixed])[0])["mean_steps"]
+    assert pair.probability is None
 
 
 @pytest.mark.parametrize(

@@ -83,3 +83,24 @@ def test_folds_of_a_seed_are_averaged_and_are_no_further_seeds(make_training):
     assert ours.band.values.tolist() == [4.0, 4.0]
     # As of any two seeds.
     assert np.isnan(ours.band.lows).all()
+
+
+def test_fold_that_one_seed_lacks_is_left_out(make_training):
+    trainings = [
+        make_training(seed, steps=(100, 200), values=(value, value), params={"data.folds": "2", "data.fold": str(fold)})
+        for seed, fold, value in ((0, 0, 1.0), (0, 1, 9.0), (1, 0, 3.0))
+    ]
+    assert curve(*trainings).band.values.tolist() == [2.0, 2.0]
+
+
+def test_values_that_are_not_finite_are_left_out(make_training):
+    ours = curve(make_training(0, steps=(100, 200, 300), values=(1.0, np.nan, 3.0)))
+    assert (ours.places.tolist(), ours.band.values.tolist()) == ([100, 300], [1.0, 3.0])
+
+
+def test_the_first_training_to_be_cut_off_ends_the_curve(make_training):
+    cut = [
+        make_training(seed, steps=range(100, end + 1, 100), values=[1.0] * (end // 100), is_whole=False)
+        for seed, end in enumerate((300, 200))
+    ]
+    assert curve(*cut, make_training(2, steps=(100, 400), values=(1.0, 1.0))).places.tolist() == [100, 200]

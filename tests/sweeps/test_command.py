@@ -224,6 +224,7 @@ MISTAKES = [
     ("hydra.searchpath=[/nowhere]", "hydra.searchpath names '/nowhere', but there is no"),
     ("study=null", "study is a section of the configuration: give its keys, such as"),
     ("agent.lr=1,2", "'agent.lr=1,2' gives several values, but those of a study come"),
+    ("seed=7", "'seed=7' has no effect in a study: study.seeds are the seeds of each trial, study.seed is that of"),
     ("study.seeds=0,1", "'study.seeds=0,1' gives several values, but a study has one"),
     ("+tracking.foo=1", "there is no key 'foo' in tracking, but only uri, experiment, artifacts, wait_s,"),
     ("study.folder=/dev/null", "study.folder is '/dev/null', but '/dev/null' is not a folder"),

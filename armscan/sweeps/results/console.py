@@ -109,7 +109,8 @@ def _print_final_results(opened: OpenedStudy, final: FinalEvaluation) -> int:
         _print_rows(title, [each.row(objective) for each in candidates])
     judgement = judge(final)
     if judgement is None or judgement.of_chosen is None:
-        code, reason = 1, "no trial or no final training has finished"
+        nothing = "final training has finished" if candidates else "trial is complete and keeps all constraints"
+        code, reason = 1, f"no {nothing}"
         if not final.is_over:
             code, reason = unfinished, "trainings are missing; the same command resumes the study"
         print(f"error: no final evaluation, because {reason}", file=sys.stderr)

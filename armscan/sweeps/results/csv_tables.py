@@ -15,7 +15,7 @@ from armscan.sweeps.results.final_results import ConfigResult
 from armscan.sweeps.results.judgement import Judgement
 from armscan.sweeps.results.selection import Candidate, score_rows
 from armscan.sweeps.scheduling.population import searched_values
-from armscan.sweeps.scheduling.state import TEST_PREFIX, is_feasible, loss_signs, seconds_of
+from armscan.sweeps.scheduling.state import TEST_PREFIX, is_feasible, loss_signs, seconds_of, was_retried
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.attribute_names import (
     ENV_STEPS,
@@ -25,7 +25,6 @@ from armscan.sweeps.storage.attribute_names import (
     METRICS,
     OBJECTIVES,
     PARENT,
-    RETRIED,
     RETRY_OF,
     RUN,
     SCHEDULE,
@@ -107,7 +106,7 @@ def _ending_rows(trials: Sequence[FrozenTrial]) -> list[Row]:
     for trial in trials:
         cause = ""
         if trial.state == TrialState.FAIL:
-            cause = cause_of(trial) + (", retried" if RETRIED in trial.user_attrs else "")
+            cause = cause_of(trial) + (", retried" if was_retried(trial) else "")
         elif trial.state == TrialState.PRUNED:
             cause = f"behind the others at environment step {max(reports_of(trial), default='unknown')}"
             if STOP in trial.user_attrs:

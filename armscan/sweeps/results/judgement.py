@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -103,7 +103,7 @@ class Judgement:
         settings: Overrides of the chosen one and the control, by their names; an empty string without any.
         n_unjudged: Number of trainings that have not ended. Default: 0.
         have_others_failed: Whether a training of every other candidate failed in the race. Default: False.
-        violated_by_control: Constraints of the study that the control violates. Default: none.
+        violated: Constraints of the study that configurations violated in the race. Default: none.
         is_repeated: Whether trainings with an earlier configuration of the study were judged before. Default: False.
     """
 
@@ -116,7 +116,7 @@ class Judgement:
     settings: Mapping[str, str]
     n_unjudged: int = 0
     have_others_failed: bool = False
-    violated_by_control: tuple[str, ...] = ()
+    violated: Mapping[int, Sequence[str]] = field(default_factory=dict)
     is_repeated: bool = False
 
     @property
@@ -125,8 +125,10 @@ class Judgement:
         notes = []
         if self.n_seeds < self.n_planned:
             notes.append(f"only {self.n_seeds} of {self.n_planned} seeds have been trained to their end")
-        if violated := " and ".join(self.violated_by_control):
-            notes.append(f"the control violates {violated}{', so it could not be chosen' * (self.chosen != CONTROL)}")
+        for number, violated in self.violated.items():
+            name = "the control" if number == CONTROL else name_of(number)
+            but = "" if self.chosen in self.violated else ", so it could not be chosen"
+            notes.append(f"{name} violates {' and '.join(violated)} in the race{but}")
         if self.is_repeated:
             notes.append("the test volumes were opened before, with another configuration of the study")
         if names := ", ".join(map(name_of, self.others)):
@@ -210,7 +212,7 @@ def judge(final: FinalEvaluation) -> Judgement | None:
         others=tuple(others),
         settings={name_of(each.number): " ".join(overrides_of(settings_of(searched, each.number))) for each in results},
         n_unjudged=final.n_unjudged,
-        violated_by_control=tuple(final.violated_by_control()),
+        violated=final.violated(),
         is_repeated=not all(map(final.is_current, complete)),
         have_others_failed=bool(of_others) and all(standing.has_failed for standing in of_others),
     )

@@ -17,9 +17,16 @@ from rich.text import Text
 from armscan.errors import ArmscanError, printable
 from armscan.sweeps.results.final_results import values_text
 from armscan.sweeps.scheduling.population import searched_values
-from armscan.sweeps.scheduling.state import StudyState, is_feasible, seconds_of
+from armscan.sweeps.scheduling.state import StudyState, is_feasible, seconds_of, was_retried
 from armscan.sweeps.space.parameter import overrides_of
-from armscan.sweeps.storage.attribute_names import ENV_STEPS, FAILURE, FINAL_SEED, FINALIST, LEASE, RETRIED, STOP
+from armscan.sweeps.storage.attribute_names import (
+    ENV_STEPS,
+    FAILURE,
+    FINAL_SEED,
+    FINALIST,
+    LEASE,
+    STOP,
+)
 from armscan.sweeps.storage.attributes import JUDGEMENT_SUFFIX
 from armscan.sweeps.study.candidates import name_of
 from armscan.sweeps.study.final_eval import FinalEvaluation
@@ -154,7 +161,7 @@ def _describe(trial: FrozenTrial, phase: Phase) -> str:
     if FINALIST in attributes:
         name = f"{what} of {name_of(attributes[FINALIST])} with seed {attributes[FINAL_SEED]}"
     if trial.state == TrialState.FAIL:
-        return f"{name} failed{', retried' if RETRIED in attributes else ''}: {attributes.get(FAILURE)} [{tried}]"
+        return f"{name} failed{', retried' if was_retried(trial) else ''}: {attributes.get(FAILURE)} [{tried}]"
     if trial.state == TrialState.PRUNED:
         how = "stopped" if STOP in attributes else "pruned"
         return f"{name} {how} after {attributes.get(ENV_STEPS)} environment steps [{tried}]"

@@ -22,6 +22,7 @@ from armscan.sweeps.scheduling.state import BEAT_S, StudyState, env_steps_of
 from armscan.sweeps.scheduling.termination import Termination
 from armscan.sweeps.storage.attribute_names import (
     ATTEMPT,
+    DROPPED,
     EARLIER_SPANS,
     ENV_STEPS,
     FAILURE,
@@ -116,8 +117,8 @@ class TrialScheduler:
             # A search reads its trials only once for a claim.
             return
         for trial in filterfalse(self._is_current, self.state().waiting):
-            self.study._storage.set_trial_user_attr(trial._trial_id, RETRIED, True)
-            self.study._storage.set_trial_user_attr(trial._trial_id, FAILURE, "the study has another configuration")
+            for name, value in ((RETRIED, True), (DROPPED, True), (FAILURE, "the study has another configuration")):
+                self.study._storage.set_trial_user_attr(trial._trial_id, name, value)
             self.study._storage.set_trial_state_values(trial._trial_id, TrialState.FAIL)
 
     def _tell(self, outcome: TrialOutcome, *, is_repeated: bool) -> None:

@@ -12,6 +12,7 @@ from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, Trial, TrialState
 
 from armscan.sweeps.storage.attribute_names import (
+    DROPPED,
     EARLIER_SPANS,
     ENV_STEPS,
     LEASE,
@@ -123,6 +124,11 @@ def metrics_of_test(metrics: Mapping[str, float]) -> dict[str, float]:
 def loss_signs(directions: Sequence[StudyDirection]) -> FloatArray:
     """Return the factors that turn objectives of these directions into losses: -1 for those to maximise, else 1."""
     return np.where([direction == StudyDirection.MAXIMIZE for direction in directions], -1.0, 1.0)
+
+
+def was_retried(trial: FrozenTrial) -> bool:
+    """Return whether another trial runs again what this one did not end; a dropped one is not run again."""
+    return RETRIED in trial.user_attrs and DROPPED not in trial.user_attrs
 
 
 def retried_by(trial: FrozenTrial | Trial, trials: Sequence[FrozenTrial]) -> Iterator[int]:

@@ -100,13 +100,16 @@ class Parameter:
         """Return whether it is searched, given the values that were chosen before."""
         return all(name in chosen and chosen[name] in values for name, values in self.when.items())
 
-    def contains(self, value: Any) -> bool:
-        """Return whether a value, as Optuna stores it, lies in its range or is one of its choices."""
+    def matching(self, value: Any) -> tuple[Value, ...]:
+        """Return a value, as Optuna stores it, if it lies in its range; or its choice that equals it; else nothing."""
         drawn: Any = self.distribution
         if isinstance(drawn, CategoricalDistribution):
-            return any(type(value) is type(choice) and value == choice for choice in drawn.choices)
+            # 1 is 1.0, but not true.
+            choices = (each for each in drawn.choices if isinstance(value, bool) == isinstance(each, bool))
+            return tuple(each for each in choices if each == value)[:1]
         whole = isinstance(drawn, IntDistribution)
-        return type(value) in ((int,) if whole else (int, float)) and bool(drawn._contains(value))
+        is_inside = type(value) in ((int,) if whole else (int, float)) and bool(drawn._contains(value))
+        return (value,) if is_inside else ()
 
     def suggest(self, trial: BaseTrial) -> Value:
         """Return the value of a trial.

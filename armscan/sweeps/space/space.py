@@ -65,8 +65,8 @@ class Space:
             name = parameter.name
             if not parameter.applies(chosen):
                 continue
-            if name in values and parameter.contains(values[name]):
-                chosen[name] = values[name]
+            if name in values and (match := parameter.matching(values[name])):
+                (chosen[name],) = match
             elif misfit is None and (name in values or not partly):
                 value = f"{name}={hydra_literal(values[name])}" if name in values else f"{name} has no value and"
                 misfit = f"{value} is not in the space"

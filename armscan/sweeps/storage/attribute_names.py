@@ -15,6 +15,8 @@ STOP = "stop"
 # Of a trial.
 LEASE, ENV_STEPS, METRICS, FAILURE = "lease", "env_steps", "figures", "failure"
 RETRIED, RETRY_OF, ATTEMPT, SEEDS = "retried", "retry_of", "attempt", "seeds"
+# Of a waiting final training that another configuration of the study does not want: it counts nowhere.
+DROPPED = "dropped"
 # When it ran before it was requeued: pairs of start and end, in seconds since 1970.
 EARLIER_SPANS = "earlier_spans"
 RUN, FOLDER, CONFIG_SHA256 = "mlflow_run", "folder", "config_sha256"

@@ -107,6 +107,11 @@ def _merging(override: str) -> str:
 
 def _check(override: Override) -> None:
     key, value = override.key_or_group, override.value()
+    if key == "seed":
+        raise InvalidValueError(
+            f"{override.input_line!r} has no effect in a study: study.seeds are the seeds of each trial, study.seed "
+            "is that of the sampler"
+        )
     if override.is_sweep_override():
         instead = f"those of a study come from its space: give '{SPACE}.{key}.choices=[...]'"
         if key.startswith(NOT_SEARCHED):

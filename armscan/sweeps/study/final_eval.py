@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -24,6 +25,7 @@ from armscan.sweeps.scheduling.race import MAX_SEEDS_FACTOR, Race, Scores, budge
 from armscan.sweeps.scheduling.state import CONTROL
 from armscan.sweeps.space.parameter import Value
 from armscan.sweeps.storage.attribute_names import (
+    DROPPED,
     FIXED,
     METRICS,
     OF_CONFIG,
@@ -104,35 +106,42 @@ class FinalEvaluation:
         return scores
 
     def race(self, scores: Scores | None = None) -> Race:
-        """Return the state of the selection's race; a control that violates a constraint leaves it early.
+        """Return the state of the selection's race; those that violate a constraint leave it after the first round.
+
+        If all violate one, all race.
 
         Args:
             scores: Result of `scores`. Default: None, the current scores.
         """
         scores, settings = self.scores() if scores is None else scores, self.settings
         run = partial(race, seeds=self.selection_seeds, min_seeds=settings.min_seeds)
-        others = {number: scores[number] for number in scores if number != CONTROL}
-        has_ended_round = scores.get(CONTROL, {}).keys() >= set(self.selection_seeds[: settings.min_seeds])
-        if others and has_ended_round and self.violated_by_control():
-            found = run(others, mean_seeds=settings.mean_seeds)
-            alone = run({CONTROL: scores[CONTROL]}, mean_seeds=settings.min_seeds)
-            gone = {CONTROL: replace(alone.standings[CONTROL], has_left=True)}
-            return replace(found, standings={**gone, **found.standings})
-        return run(scores, mean_seeds=settings.mean_seeds)
+        first_round, violated = set(self.selection_seeds[: settings.min_seeds]), self.violated()
+        gone = {number: of for number, of in scores.items() if number in violated and of.keys() >= first_round}
+        if not gone or len(gone) == len(scores):
+            return run(scores, mean_seeds=settings.mean_seeds)
+        alone = run(gone, mean_seeds=settings.min_seeds).standings
+        left = {number: replace(standing, has_left=True) for number, standing in alone.items()}
+        found = run({number: scores[number] for number in scores if number not in gone}, mean_seeds=settings.mean_seeds)
+        standings = {**left, **found.standings}
+        return replace(found, standings={number: standings[number] for number in scores})
 
-    def violated_by_control(self) -> list[str]:
-        """Return the constraints of the study that the control violates, on average over its trainings of the race."""
-        metrics = [
-            trial.user_attrs.get(METRICS, {})
-            for trial in self._counted_trials(self.selection)
-            if trial.state == TrialState.COMPLETE and training_of(trial)[0] == CONTROL
-        ]
+    def violated(self) -> dict[int, list[str]]:
+        """Return the constraints that configurations violate on average over their trainings of the race, if any."""
         stored = self.search.user_attrs.get(FIXED, {}).get(CONSTRAINTS)
-        return [
-            str(each)
-            for each in map(Constraint.read, stored if isinstance(stored, list) else ())
-            if metrics and each.violation({each.metric: fmean(of.get(each.metric, math.nan) for of in metrics)}) > 0
-        ]
+        constraints = [Constraint.read(each) for each in stored] if isinstance(stored, list) else []
+        metrics: dict[int, list[Mapping[str, float]]] = defaultdict(list)
+        for trial in self._counted_trials(self.selection) if constraints else ():
+            if trial.state == TrialState.COMPLETE:
+                metrics[training_of(trial)[0]].append(trial.user_attrs.get(METRICS, {}))
+        violated = {
+            number: [
+                str(each)
+                for each in constraints
+                if each.violation({each.metric: fmean(one.get(each.metric, math.nan) for one in of_number)}) > 0
+            ]
+            for number, of_number in metrics.items()
+        }
+        return {number: each for number, each in violated.items() if each}
 
     def missing_of_selection(self) -> list[PlannedTrial]:
         """Return the trainings that the selection needs next and no worker has begun."""
@@ -199,11 +208,11 @@ class FinalEvaluation:
     def _counted_trials(self, study: optuna.Study) -> list[FrozenTrial]:
         """Return the trials of a study that count.
 
-        Not those of an earlier configuration of the study, nor failed ones that a later start ignores: both are
-        run again.
+        Not those of an earlier configuration of the study, failed ones that a later start ignores, nor waiting ones
+        that another configuration dropped: all are run again.
         """
         ignored = study.user_attrs.get(RESET_FAILURES, ())
-        trials = study.get_trials(deepcopy=False)
+        trials = [trial for trial in study.get_trials(deepcopy=False) if DROPPED not in trial.user_attrs]
         return [trial for trial in trials if trial.number not in ignored and self.is_current(trial)]
 
 

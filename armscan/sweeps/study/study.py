@@ -56,8 +56,7 @@ def make_study(storage: Storage, settings: StudySettings, fixed: Mapping[str, An
             directions=[*settings.objectives.values()],
             load_if_exists=True,
         )
-        # Also if the process that created it died before it stored its settings.
-        if not study.user_attrs.keys() >= wanted.keys() and not study.get_trials(deepcopy=False):
+        if _lacks_settings(study, wanted):
             for key, value in wanted.items():
                 study.set_user_attr(key, value)
         return study
@@ -93,9 +92,16 @@ def existing_study(storage: Storage | None, settings: StudySettings, fixed: Mapp
             another configuration.
     """
     study = storage.study(settings.name) if storage is not None else None
-    if study is not None:
-        _check_same(settings, study, comparable_settings(settings, fixed))
+    wanted = comparable_settings(settings, fixed)
+    if study is None or _lacks_settings(study, wanted):
+        return None
+    _check_same(settings, study, wanted)
     return study
+
+
+def _lacks_settings(study: optuna.Study, wanted: Mapping[str, Any]) -> bool:
+    """Return whether the process that created a study died before it stored its settings."""
+    return not study.user_attrs.keys() >= wanted.keys() and not study.get_trials(deepcopy=False)
 
 
 def fixed_config(

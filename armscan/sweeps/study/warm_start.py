@@ -157,6 +157,8 @@ def _of_study(settings: StudySettings, name: str, fixed: Mapping[str, Any], stor
     if difference is None:
         taken = tuple(_taken(name, trial, chosen, settings.space) for trial, chosen in fitting)
         return InitialTrials(SOURCE.format(name), f"{message}{len(taken)} taken with their values{left}", taken)
+    if _is_opposed(source, wanted):
+        return InitialTrials(SOURCE.format(name), f"{message}none taken, because {difference}{left}", ())
     settings_of = {trial.number: chosen for trial, chosen in fitting if chosen}
     best = best_trials(source, len(trials))
     first = first_different(settings_of[trial.number] for trial in best if trial.number in settings_of)
@@ -182,7 +184,7 @@ def _difference(source: optuna.Study, wanted: Mapping[str, Any]) -> str | None:
     there = source.user_attrs
     # The values of a trial are in this order.
     if [*there[OBJECTIVES].items()] != [*wanted[OBJECTIVES].items()]:
-        return f"its objectives are {' and '.join(there[OBJECTIVES])}"
+        return f"its objectives are {' and '.join(f'{way} {name}' for name, way in there[OBJECTIVES].items())}"
     searched = tuple(f"{key}." for key in (*renamed(there[SPACE]), *wanted[SPACE]))
     before, now = fixed_of(source, wanted)
     keys = [key for key in {**before, **now} if not f"{key}.".startswith(searched)]
@@ -191,6 +193,12 @@ def _difference(source: optuna.Study, wanted: Mapping[str, Any]) -> str | None:
         return None
     shown = f"its {different[0]} is {before.get(different[0])}, and not {now.get(different[0])}"
     return shown + (f" ({len(different) - 1} others differ)" if len(different) > 1 else "")
+
+
+def _is_opposed(source: optuna.Study, wanted: Mapping[str, Any]) -> bool:
+    """Return whether a study optimises an objective in the other direction: its best trials are the worst here."""
+    there = source.user_attrs[OBJECTIVES]
+    return any(there.get(name, way) != way for name, way in wanted[OBJECTIVES].items())
 
 
 def _not_searched(params: Mapping[str, Value], chosen: Mapping[str, Value], fixed: Mapping[str, Value]) -> str | None:

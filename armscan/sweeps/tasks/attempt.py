@@ -8,15 +8,16 @@ from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from numbers import Real
 from pathlib import Path
-from statistics import fmean
 from typing import Any, Protocol
 
+import numpy as np
 import optuna
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from optuna.trial import Trial
 
 from armscan.errors import InvalidValueError, listed
+from armscan.stats.bootstrap import interquartile_mean, mean
 from armscan.sweeps.scheduling.claim import PendingWrites
 from armscan.sweeps.scheduling.state import retried_by
 from armscan.sweeps.storage.attribute_names import ENV_STEPS, EPISODES, INTERVAL, PARENT, RETRY_OF, RUN, SEEDS
@@ -165,7 +166,7 @@ class Attempt:
         if step in self._reported:
             return
         self._reported.add(step)
-        values = [fmean(one[name] for one in (*done, metrics)) for name in self.objectives]
+        values = [over_seeds(name, [one[name] for one in (*done, metrics)]) for name in self.objectives]
         if self.writes.flush_with(self.transaction, partial(self._is_to_be_pruned, step, values)):
             raise optuna.TrialPruned
 
@@ -175,6 +176,11 @@ class Attempt:
         # connection, and they refuse several objectives.
         store_report(storage, trial_id, step, values)
         return study.pruner.prune(study, storage.get_trial(trial_id))
+
+
+def over_seeds(metric: str, values: Sequence[float]) -> float:
+    """Return a metric of a trial: the interquartile mean over its seeds; the mean of `solved`, a share of the seeds."""
+    return float((mean if metric == "solved" else interquartile_mean)(np.array(values)))
 
 
 class Task(Protocol):

@@ -9,7 +9,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
 import optuna
 from omegaconf import DictConfig
 
@@ -29,10 +28,9 @@ from armscan.experiment.job import Invocation, Job
 from armscan.experiment.provenance import place_tags, start_tracking, volume_tags
 from armscan.experiment.results import RunResult
 from armscan.experiment.runner import VIDEO_SEED, log_result, train_agent
-from armscan.stats.bootstrap import interquartile_mean, mean
 from armscan.sweeps.scheduling.limits import LimitReachedError
 from armscan.sweeps.scheduling.state import TEST_PREFIX
-from armscan.sweeps.tasks.attempt import Attempt, volumes_of
+from armscan.sweeps.tasks.attempt import Attempt, over_seeds, volumes_of
 from armscan.sweeps.tasks.generation import begin_generation
 from armscan.sweeps.tasks.reporter import TRAINING_METRICS, Reporter
 from armscan.tracking import TrackedRun, TrackingStore, draw_learning_curve, open_store, run_of_study, take_over
@@ -95,9 +93,7 @@ class TrainingTask:
             if seed not in attempt.seeds_done or is_elsewhere:
                 attempt.keep_seed(seed, _train(attempt, seed))
         of_seeds = [attempt.seeds_done[seed] for seed in attempt.seeds]
-        scores = {name: np.array([metrics[name] for metrics in of_seeds]) for name in of_seeds[0]}
-        figures = {name: mean if name == "solved" else interquartile_mean for name in scores}
-        return {name: float(figures[name](of_name)) for name, of_name in scores.items()}
+        return {name: over_seeds(name, [metrics[name] for metrics in of_seeds]) for name in of_seeds[0]}
 
     def validate(self, attempt: Attempt) -> dict[str, float]:
         """Train, and return the metrics of validation episodes that had no part in choosing the weights."""

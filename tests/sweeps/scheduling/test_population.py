@@ -226,3 +226,13 @@ def test_attributes_that_a_stranger_wrote_are_refused_in_one_line(tmp_path, name
         check_trials(study)
     assert str(raised.value).startswith(line)
     assert isinstance(raised.value, StudyError | ValueError)
+
+
+def test_checkpoint_of_a_dead_attempt_is_kept_for_its_retry(tmp_path):
+    simulation = Simulation(tmp_path)
+    dead = simulation.claim()
+    simulation.scheduler.reclaim(lambda _: True)
+    # Waiting, then running.
+    for _ in range(2):
+        assert dead.number in simulation.population.checkpoints_to_keep(simulation.trials)
+        simulation.claim()

@@ -12,7 +12,7 @@ import optuna
 import pytest
 from optuna.trial import TrialState, create_trial
 
-from armscan.sweeps.scheduling.claim import PlannedTrial
+from armscan.sweeps.scheduling.claim import PendingWrites, PlannedTrial, TrialOutcome
 from armscan.sweeps.scheduling.state import StudyState, retried_by, seconds_of
 from armscan.sweeps.storage.attribute_names import (
     ATTEMPT,
@@ -439,3 +439,39 @@ def test_request_to_stop_a_trial_is_not_forgotten_between_two_checks(make_schedu
         now_s[0] += lease_module.HEARTBEAT_S
     with pytest.raises(optuna.TrialPruned):
         heartbeat.report_progress({})
+
+
+def test_failures_that_two_starts_ignored_stay_ignored(make_scheduler):
+    scheduler = make_scheduler(max_failures=0)
+    for _ in range(2):
+        fail(scheduler, scheduler.claim({}), "no luck")
+        assert scheduler.reset_failures() == 1
+        assert scheduler.failures(scheduler.state()) == []
+
+
+def test_each_time_before_a_requeue_is_kept(make_scheduler):
+    scheduler = make_scheduler()
+    for _ in range(2):
+        scheduler.requeue(scheduler.claim({}), {})
+        assert scheduler.state().waiting[0].user_attrs[LEASE]["started"] == ""
+    finish(scheduler, scheduler.claim({}))
+    assert len(scheduler.state().finished[0].user_attrs[EARLIER_SPANS]) == 2
+
+
+def test_requeue_by_a_worker_that_has_lost_the_trial_changes_nothing(make_scheduler):
+    scheduler = make_scheduler()
+    trial = scheduler.claim({"worker": "a"})
+    scheduler.requeue(trial, {"worker": "a"})
+    scheduler.claim({"worker": "b"})
+    scheduler.requeue(trial, {"worker": "a"})
+    (running,) = scheduler.state().running
+    assert running.user_attrs[LEASE] == {"worker": "b"}
+
+
+def test_failure_that_another_worker_told_is_not_told_again(make_scheduler):
+    scheduler = make_scheduler(max_retries=0, max_failures=10)
+    trial = scheduler.claim({"worker": "a"})
+    outcome = TrialOutcome(trial, TrialState.FAIL, PendingWrites())
+    scheduler.reclaim(lambda _: True)
+    scheduler.claim({"worker": "a"}, outcome)
+    assert not outcome.is_told

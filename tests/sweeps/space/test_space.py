@@ -184,3 +184,12 @@ def test_values_fit_that_the_distribution_of_a_trial_would_accept(value):
         else:
             assert chosen == {}
             assert misfit.endswith("is not in the space")
+
+
+@pytest.mark.parametrize(("value", "expected"), [(1.0, 1), (1, 1), (0.1, 0.1), (True, None), (2, None)])
+def test_choice_is_found_by_its_value(value, expected):
+    space = Space.read({"agent.lr_end_factor": {"choices": [0.1, 1]}})
+    chosen, misfit = space.fit({"agent.lr_end_factor": value})
+    assert chosen == ({} if expected is None else {"agent.lr_end_factor": expected})
+    assert type(chosen.get("agent.lr_end_factor")) is type(expected)
+    assert (misfit is None) == (expected is not None)

@@ -11,6 +11,9 @@ from optuna.trial import TrialState
 
 from armscan.errors import StudyError
 from armscan.stats.bootstrap import Estimate
+from armscan.stats.paired import paired_difference
+from armscan.sweeps.results import judgement as judgement_module
+from armscan.sweeps.results.csv_tables import _ending_rows
 from armscan.sweeps.results.judgement import COMPARISONS, Difference, Judgement, best_metrics, judge, result_note
 from armscan.sweeps.results.progress import final_line
 from armscan.sweeps.results.selection import candidates_of
@@ -446,13 +449,13 @@ def test_trainings_of_an_earlier_configuration_of_the_study_are_run_again(storag
     assert "the test volumes were opened before, with another configuration of the study" in judge(again).notes
 
 
-@pytest.mark.parametrize(("constraint", "is_kept"), [("mean_steps <= 2", False), ("mean_steps <= 9", True)])
+@pytest.mark.parametrize(("constraint", "is_kept"), [("mean_steps >= 2", False), ("mean_steps >= 0", True)])
 def test_control_that_violates_a_constraint_is_judged_but_not_chosen(storage_uri, constraint, is_kept):
-    final = run(storage_uri, true=TRUE | {CONTROL: 2.5}, constraints=[constraint])
-    assert final.violated_by_control() == ([] if is_kept else [constraint])
+    final = run(storage_uri, true=TRUE | {CONTROL: 1.0}, constraints=[constraint])
+    assert final.violated().get(CONTROL, []) == ([] if is_kept else [constraint])
     judgement = judge(final)
     assert judgement.chosen == (CONTROL if is_kept else 1)
-    told = f"the control violates {constraint}, so it could not be chosen"
+    told = f"the control violates {constraint} in the race, so it could not be chosen"
     assert (told in judgement.notes) is not is_kept
     assert {number for number, _ in trained(final.judgement)} == {CONTROL, judgement.chosen}
 
@@ -463,6 +466,76 @@ def test_control_that_violates_a_constraint_leaves_the_race_after_its_first_roun
     seeds = {number: standing.n_seeds for number, standing in final.race().standings.items()}
     assert seeds[CONTROL] == FINAL_EVAL["min_seeds"]
     assert seeds[0] + seeds[1] == 16
+
+
+def test_candidate_that_violates_a_constraint_in_the_race_is_not_chosen(storage_uri):
+    final = run(storage_uri, true={CONTROL: 2.5, 0: 6.0, 1: 1.0, 2: 9.0}, constraints=["mean_steps >= 2"])
+    assert final.violated() == {1: ["mean_steps >= 2"]}
+    assert final.race().standings[1].has_left
+    judgement = judge(final)
+    assert judgement.chosen == CONTROL
+    assert "trial 1 violates mean_steps >= 2 in the race, so it could not be chosen" in judgement.notes
+
+
+def test_configurations_race_on_if_all_violate_a_constraint(storage_uri):
+    final = run(storage_uri, true={CONTROL: 5.0, 0: 6.0, 1: 4.0, 2: 9.0}, constraints=["mean_steps <= 1"])
+    assert judge(final).chosen == 1
+    assert "trial 1 violates mean_steps <= 1 in the race" in judge(final).notes
+
+
+def test_one_seed_that_violates_a_constraint_does_not_decide(storage_uri):
+    final, (selection, _) = opened(storage_uri, constraints=["mean_steps <= 3"])
+    steps = iter((1.0, 4.0))
+    while (trial := selection.claim({})) is not None:
+        number, _ = training_of(trial)
+        value = next(steps, 1.0) if number == CONTROL else 1.0
+        trial.set_user_attr(METRICS, {"mean_steps": value})
+        trial.study.tell(trial, value)
+    assert final.violated() == {}
+
+
+def test_configuration_that_is_changed_back_trains_what_the_other_dropped(storage_uri):
+    other = {"env": {"max_steps": 40}}
+    for fixed in (None, other):
+        _, (selection, _) = opened(storage_uri, fixed=fixed)
+        selection.requeue(selection.claim({"worker": "a"}), {"worker": "a"})
+    final = run(storage_uri)
+    assert final.race().chosen == 1
+    dropped = [trial for trial in final.selection.trials if trial.state == TrialState.FAIL]
+    told = {row["cause"] for row in _ending_rows(dropped)}
+    assert {"the study has another configuration"} <= told
+    assert "the study has another configuration, retried" not in told
+
+
+def test_difference_counts_volumes_of_one_arm_once(storage_uri, monkeypatch):
+    given = []
+    monkeypatch.setattr(judgement_module, "subjects_of", lambda _: {"v0": "a", "v1": "a", "v2": "b"})
+
+    def recorded(*arguments):
+        given.append(arguments[2])
+        return paired_difference(*arguments)
+
+    monkeypatch.setattr(judgement_module, "paired_difference", recorded)
+    judge(run(storage_uri))
+    assert given[0] == ["a", "a", "b"]
+
+
+def test_training_that_waits_for_its_retry_is_still_to_be_judged(storage_uri):
+    final = run(storage_uri, judge_seeds=3)
+    _, (_, judgement) = opened(storage_uri, judge_seeds=4)
+    final, _ = opened(storage_uri, judge_seeds=4)
+    n_unjudged = final.n_unjudged
+    assert n_unjudged > 0
+    judgement.claim({"worker": "a"})
+    judgement.reclaim(lambda _: True)
+    assert final.n_unjudged == n_unjudged
+
+
+def test_settings_that_a_continued_study_has_are_stored(storage_uri):
+    opened(storage_uri)
+    opened(storage_uri, judge_seeds=5)
+    storage, _, search = searched(storage_uri)
+    assert len(stored_final_eval(storage, search).judge_seeds) == 5
 
 
 def test_trainings_of_an_earlier_configuration_neither_run_nor_count_as_failed(storage_uri):

@@ -104,7 +104,7 @@ def test_value_of_a_key_that_is_searched_no_more_must_be_the_fixed_one(study_in)
     [
         ({}, ZY, "its projection is y, and not zy"),
         ({"seeds": (0, 1)}, FIXED, "its study.seeds is [0], and not [0, 1]"),
-        ({"objectives": {"solved": "maximize"}}, FIXED, "its objectives are mean_steps"),
+        ({"objectives": {"solved": "maximize"}}, FIXED, "its objectives are minimize mean_steps"),
     ],
     ids=["task", "seeds", "objectives"],
 )
@@ -118,6 +118,14 @@ def test_best_settings_of_another_configuration_are_tried_first_without_their_va
     queued = [trial.system_attrs["fixed_params"] for trial in made[2].trials]
     assert queued == [{"agent.lr": pytest.approx(5e-4 * (20 - each))} for each in range(N_ENQUEUED)]
     assert {trial.state for trial in made[2].trials} == {TrialState.WAITING}
+
+
+def test_settings_that_were_best_in_the_other_direction_are_not_tried(study_in):
+    study_in("before", {"agent.lr": LR}, rows=[({"agent.lr": 1e-3}, 3.0)])
+    made = study_in("now", {"agent.lr": LR}, warm_start=["before"], objectives={"mean_steps": "maximize"})
+    (told,) = begin(made)
+    assert told.endswith("none taken, because its objectives are minimize mean_steps")
+    assert made[2].trials == []
 
 
 def test_study_begins_once_also_where_a_process_ended_in_between(study_in, monkeypatch):

@@ -7,6 +7,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from armscan.sweeps.tasks import training
+from armscan.sweeps.tasks.attempt import over_seeds
 from armscan.sweeps.tasks.training import _begun_in
 from armscan.tracking import open_store
 
@@ -41,3 +42,9 @@ def test_training_is_gone_on_with_if_this_study_has_begun_it(tmp_path, database,
     attempt = SimpleNamespace(run_id=this, tags={"study": "a"}, trial=SimpleNamespace(number=0))
     found = _begun_in(tmp_path, attempt, OmegaConf.create({"tracking": tracking, "seed": 0}))
     assert (found is not None and found[1].info.run_id == training) is is_ours
+
+
+def test_trial_reports_and_returns_the_same_figure_over_its_seeds():
+    assert over_seeds("mean_steps", [1.0, 1.0, 25.0, 1.0]) == 1.0
+    assert over_seeds("mean_steps", [1.0, 4.0]) == 2.5
+    assert over_seeds("solved", [0.0, 1.0, 1.0, 1.0]) == 0.75

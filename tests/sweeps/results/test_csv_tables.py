@@ -1,0 +1,34 @@
+"""Rows of a study's CSV files."""
+
+import optuna
+import pytest
+
+from armscan.stats.bootstrap import Estimate
+from armscan.sweeps.results.csv_tables import _difference_rows, _importance_rows
+from armscan.sweeps.results.judgement import Difference, Judgement
+
+
+def test_differences_have_the_probability_beside_the_difference():
+    difference = Difference("success_rate", True, Estimate(0.1, 0.0, 0.2), Estimate(0.7, 0.5, 0.9))
+    judgement = Judgement(
+        chosen=3, results=(), differences=(difference,), n_seeds=2, n_planned=2, others=(), settings={}
+    )
+    (row,) = _difference_rows(judgement)
+    assert [row[name] for name in ("probability", "probability_low", "probability_high")] == [0.7, 0.5, 0.9]
+
+
+@pytest.mark.parametrize("direction", ["maximize", "minimize"])
+def test_importances_of_each_of_several_objectives_explain_its_best_trials(direction):
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    sign = 1.0 if direction == "maximize" else -1.0
+    rows = []
+    for n_objectives in (1, 2):
+        study = optuna.create_study(
+            directions=[direction] * n_objectives, sampler=optuna.samplers.RandomSampler(seed=0)
+        )
+        for _ in range(60):
+            trial = study.ask()
+            x, y = (trial.suggest_float(name, 0.0, 1.0) for name in "xy")
+            study.tell(trial, [sign * (x if x > 0.5 else 0.5 * y)] * n_objectives)
+        rows.append(_importance_rows(study, ["a", "b"][:n_objectives]))
+    assert rows[1][:2] == rows[0] != []
