@@ -22,10 +22,11 @@ def rules_in(params: Mapping[str, str]) -> dict[str, str]:
 
 
 def have_same_task(params: Iterable[Mapping[str, str]]) -> bool:
-    """Return whether the parameters of all runs name the same task on the same test volumes."""
+    """Return whether all runs have the same task and test volumes, as far as they have stored their parameters."""
     tasks = [
         rules_in(each)
         | {key: value for key, value in each.items() if is_under(key, ("data",)) and key not in NOT_TESTED_ON}
         for each in params
+        if each
     ]
     return all(task == tasks[0] for task in tasks)
