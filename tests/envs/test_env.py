@@ -2,6 +2,7 @@
 
 import copy
 import json
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -404,3 +405,10 @@ def test_env_shows_its_slice_but_does_not_hand_it_out(wrist):
 def test_env_takes_volumes_only_under_their_names(wrist):
     with pytest.raises(InvalidValueError, match="volumes holds 'wrist' as 'a'"):
         ArmscanEnv({"a": wrist})
+
+
+def test_reward_at_the_threshold_is_not_yet_a_success(phantom):
+    rules = ArmscanEnv([phantom]).rules
+    view = rules._labelled_view(phantom)
+    assert not rules.is_solved(replace(view, reward=-rules.success_threshold))
+    assert rules.is_solved(replace(view, reward=-rules.success_threshold / 2))

@@ -171,3 +171,21 @@ def test_outbox_that_is_a_link_is_not_opened_and_what_it_leads_to_stays(tmp_path
     with pytest.raises(TrackingError, match="is a link, but outboxes are files of the run's own folder"):
         Outbox(file, timeout_s=0.0)
     assert precious.read_text() == "no line that ends"
+
+
+def test_entry_of_which_a_full_disk_took_a_part_leaves_no_partial_line(outbox, monkeypatch):
+    outbox.add(tags={"a": "b"})
+    appending = outbox._appending
+    monkeypatch.setattr(outbox, "_appending", Mock(wraps=appending, write=lambda line: appending.write(line[:5])))
+    with pytest.raises(OSError, match="No space left on device"):
+        outbox.add(tags={"c": "d"})
+    monkeypatch.setattr(outbox, "_appending", appending)
+    outbox.add(tags={"e": "f"})
+    assert [entry["tags"] for entry in outbox.entries() if "tags" in entry] == [{"a": "b"}, {"e": "f"}]
+
+
+def test_status_of_a_run_is_its_last(outbox):
+    assert outbox.status is None
+    for status in ("RUNNING", "FAILED"):
+        outbox.add(status=(status, 7))
+    assert outbox.status == "FAILED"
