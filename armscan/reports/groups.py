@@ -146,13 +146,14 @@ def _names(firsts: Sequence[TrackedTraining]) -> list[str]:
         words = [f"{each}={training.choices.get(each, '?')}" for each in chosen]
         for key in keys:
             section = key.partition(".")[0]
-            # The name of a choice implies its values, except for those in which groups with this choice differ.
+            # The name of a choice implies its values, except for those that were overridden, or in which groups with
+            # this choice differ.
             alike = [
                 params[other].get(key)
                 for other, each in enumerate(firsts)
                 if section not in chosen or each.choices.get(section) == training.choices.get(section)
             ]
-            if key in params[number] and len(set(alike)) > 1:
+            if key in params[number] and (len(set(alike)) > 1 or key in training.overridden):
                 words.append(f"{key}={params[number][key]}")
         names.append(", ".join(words) or SEED_IN_NAME.sub("", training.name))
     return _distinct(names)

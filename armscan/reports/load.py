@@ -67,6 +67,7 @@ class TrackedTraining:
         series: Curves by the name of the metric.
         evaluation: Final evaluation on the test volumes; None if it has kept none.
         baselines: Episodes of the baselines on the test volumes, by their names. Default: none, as in older runs.
+        overridden: Keys that its command line set. Default: none.
         commit: Commit of the code, or the version of an installed package. Default: None, not known.
         volumes: Fingerprints of its volumes by split (training, validation, test) and name; None if it has kept none.
         video: Episode as an animated GIF; None if it has kept none.
@@ -82,6 +83,7 @@ class TrackedTraining:
     series: Mapping[str, Series] = field(repr=False)
     evaluation: Evaluation | None = field(repr=False)
     baselines: Mapping[str, Evaluation] = field(default_factory=dict, repr=False)
+    overridden: frozenset[str] = frozenset()
     commit: str | None = None
     volumes: Fingerprints | None = field(repr=False)
     video: bytes | None = field(repr=False)
@@ -179,6 +181,7 @@ def _training(run: Run, histories: Mapping[str, History], files: Mapping[str, by
         series=series,
         evaluation=evaluation if evaluation and evaluation.episodes else None,
         baselines=baselines or {},
+        overridden=frozenset(word.lstrip("+").partition("=")[0] for word in tags.get("overrides", "").split()),
         commit=tags.get("mlflow.source.git.commit", tags.get(VERSION_TAG)),
         volumes=_parsed(run, files, VOLUMES_FILE, lambda contents: fingerprints_in(contents, VOLUMES_FILE)),
         video=files.get(VIDEO_FILE),

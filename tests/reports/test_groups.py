@@ -50,6 +50,12 @@ def test_a_choice_stands_for_all_that_it_brings_but_for_what_its_own_groups_diff
     assert names(*trainings) == ["agent=sac, agent.lr=0.1", "agent=sac, agent.lr=0.2", "agent=ppo"]
 
 
+def test_key_that_the_command_line_set_is_named_beside_the_choice(make_training):
+    sac = make_training(params={"agent.lr": "0.5", "agent.tau": "0.1"}, overridden=frozenset({"agent", "agent.lr"}))
+    ppo = make_training(params={"agent.lr": "0.3", "agent.clip": "0.2"}, choices={"agent": "ppo"})
+    assert names(sac, ppo) == ["agent=sac, agent.lr=0.5", "agent=ppo"]
+
+
 def test_groups_that_no_key_tells_apart_have_numbers(make_training):
     # As where a key is new.
     trainings = [make_training(params=each) for each in ({}, {"a": "1"}, {"b": "1"})]
