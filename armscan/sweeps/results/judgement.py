@@ -212,7 +212,7 @@ def judge(final: FinalEvaluation) -> Judgement | None:
         others=tuple(others),
         settings={name_of(each.number): " ".join(overrides_of(settings_of(searched, each.number))) for each in results},
         n_unjudged=final.n_unjudged,
-        violated=final.violated(),
+        violated={number: each for number, each in final.violated().items() if number in race.standings},
         is_repeated=not all(map(final.is_current, complete)),
         have_others_failed=bool(of_others) and all(standing.has_failed for standing in of_others),
     )
