@@ -88,6 +88,7 @@ class TrialAttributes(_Attributes):
     taken_from: Text = ""
     enqueued_from: Text = ""
     retried: bool = Field(default=False, description="true or false")
+    dropped: bool = Field(default=False, description="true or false")
     retry_of: Number = 0
     attempt: Number = 0
     seeds: dict[Annotated[str, Field(pattern=r"^[0-9]{1,10}$")], dict[str, float]] = Field(
