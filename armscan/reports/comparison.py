@@ -37,8 +37,8 @@ from armscan.utils.text import counted
 HOW_CURVES = (
     "On the validation volumes, after each epoch. Thick: the mean of the seeds of a group. Band: its 95 % interval "
     "for other seeds (Student's), if there are three or more. Thin: each seed. A training that ran to its end before "
-    "others of its group is carried on with its last value; where one was cut off, is still running, or has a metric "
-    "that became NaN, the curve of its group ends. Seconds are wall time of training and validation, on the machine of the run."
+    "others of its group is carried on with its last value. Where one was cut off, is still running, or has a "
+    "metric that became NaN, the curve of its group ends. Seconds are wall time of training and validation, on the machine of the run."
 )
 MEANS_ALONE = "Of so many groups only the means are drawn: curves.csv has the bands, seed_curves.csv the seeds."
 HOW_FINAL = (
@@ -200,7 +200,7 @@ def _better(groups: Sequence[Group], pairs: Mapping[str, Sequence[Pair]]) -> Ite
         sum(each.probability is not None and math.isfinite(each.probability.low) for each in of_figure)
         for of_figure in pairs.values()
     )
-    by_chance = f" Of {counted(n_pairs, 'pair')}, {0.05 * n_pairs:.2g} would be bold by chance if all groups were alike."
+    by_chance = f" Of {n_pairs} pairs, {0.05 * n_pairs:.2g} would be bold by chance if all groups were alike."
     drawn = f'<p>{HOW_BETTER}{by_chance * (n_pairs > 1)}</p><div class="matrices">{"".join(matrices)}</div>'
     yield drawn if len(groups) <= MANY_PAIRS else folded(f"Each of {len(groups)} groups against each other", drawn)
 
