@@ -38,7 +38,8 @@ HOW_CURVES = (
     "On the validation volumes, after each epoch. Thick: the mean of the seeds of a group. Band: its 95 % interval "
     "for other seeds (Student's), if there are three or more. Thin: each seed. A training that ran to its end before "
     "others of its group is carried on with its last value. Where one was cut off, is still running, or has a "
-    "metric that became NaN, the curve of its group ends. Seconds are wall time of training and validation, on the machine of the run."
+    "metric that became NaN, the curve of its group ends. Seconds are wall time of training and validation, on the "
+    "machine of the run."
 )
 MEANS_ALONE = "Of so many groups only the means are drawn: curves.csv has the bands, seed_curves.csv the seeds."
 HOW_FINAL = (
