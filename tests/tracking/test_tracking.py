@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import json
 import math
 import sqlite3
@@ -441,3 +442,15 @@ def test_store_is_not_opened_where_the_policy_is_neither_kept_nor_not(tmp_path):
     with pytest.raises(InvalidValueError, match=r"tracking\.policy is 'maybe'"):
         open_store(f"sqlite:///{tmp_path}/runs.db", experiment="a", artifacts="b", wait_s=1.0, policy="maybe")
     assert not list(tmp_path.iterdir())
+
+
+def test_opening_a_store_keeps_the_locks_that_this_process_has_on_it(tmp_path):
+    file = tmp_path / "runs.db"
+    opened = functools.partial(open_store, f"sqlite:///{file}", experiment="a", artifacts=str(tmp_path), wait_s=0)
+    opened()
+    writes = "import sqlite3, sys; sqlite3.connect(sys.argv[1], timeout=0).execute('BEGIN IMMEDIATE')"
+    with contextlib.closing(sqlite3.connect(file, isolation_level=None)) as connection:
+        connection.execute("BEGIN IMMEDIATE")
+        opened()
+        other = subprocess.run([sys.executable, "-c", writes, str(file)], capture_output=True, text=True, check=False)
+    assert "database is locked" in other.stderr
