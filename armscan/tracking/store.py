@@ -86,8 +86,8 @@ def open_store(
         # Processes that create the tables of a fresh SQLite file at once can leave it unusable.
         database = sqlite_file(uri)
         database.parent.mkdir(parents=True, exist_ok=True)
-        # Fail now if the file cannot be created: MLflow would retry for minutes, and the lock would wait forever. Do not
-        # open it: closing it would drop the locks of this process's connections, and other processes could then write
+        # Fail now if the file cannot be created: MLflow would retry for minutes, and the lock would wait forever. Do
+        # not open it: closing it would drop the locks of this process's connections, and other processes could write
         # at the same time, which destroys the database (https://sqlite.org/howtocorrupt.html, section 2.2).
         check_writable(database)
         with FileLock(f"{database}.lock", timeout=LOCK_TIMEOUT_S):
