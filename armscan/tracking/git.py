@@ -11,6 +11,7 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
+from armscan.tracking.tags import COMMIT_TAG
 from armscan.utils.files import sha256
 
 COMMIT, DIRTY, DIFF_SUM = "git.commit", "git.dirty", "git.diff.sha256"
@@ -37,7 +38,7 @@ class CodeState:
     @property
     def tags(self) -> dict[str, str]:
         """Tags that identify the code."""
-        known = {} if self.commit == UNKNOWN else {"mlflow.source.git.commit": self.commit}
+        known = {} if self.commit == UNKNOWN else {COMMIT_TAG: self.commit}
         dirty = UNKNOWN if self.diff is None else str(bool(self.diff)).lower()
         summed = {DIFF_SUM: sha256(self.diff)} if self.diff else {}
         return {COMMIT: self.commit, **known, DIRTY: dirty, **summed}

@@ -1,7 +1,8 @@
 """Names of the tags of runs in MLflow."""
 
-# MLflow's own tags: the parent of a run, and its description.
+# MLflow's own tags: the parent of a run, its description, and the commit of its code.
 PARENT_TAG, DESCRIPTION_TAG = "mlflow.parentRunId", "mlflow.note.content"
+COMMIT_TAG = "mlflow.source.git.commit"
 # Absolute path of a run's folder, and the name of its machine.
 FOLDER_TAG, HOST_TAG = "folder", "host"
 # Version of armscan that made a run.
