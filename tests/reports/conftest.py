@@ -24,7 +24,9 @@ SMALL = [
     ),
     *("agent.num_envs=4", "agent.batch_size=16", "network=mlp", "network.hidden_sizes=[8]"),
 ]
-AGENTS = {"sac": ["agent.learning_starts=60"], "ppo": ["agent.env_steps_per_collection=100"]}
+AGENTS = {"sac": "agent.learning_starts=60", "ppo": "agent.env_steps_per_collection=100"}
+# Names of their groups in reports.
+GROUPS = {agent: f"agent={agent}, {key}" for agent, key in AGENTS.items()}
 
 
 class Runs:
@@ -52,9 +54,9 @@ def runs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        for agent, words in AGENTS.items():
+        for agent, key in AGENTS.items():
             for seed in range(3):
-                patch.setattr(sys, "argv", ["armscan.run", f"agent={agent}", f"seed={seed}", *words, *SMALL])
+                patch.setattr(sys, "argv", ["armscan.run", f"agent={agent}", f"seed={seed}", key, *SMALL])
                 # The command sets it, and would take it for the user's setting the next time.
                 patch.setenv("HYDRA_FULL_ERROR", "0")
                 GlobalHydra.instance().clear()

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from mlflow.entities import Metric, Param
 
-from tests.reports.conftest import rows
+from tests.reports.conftest import GROUPS, rows
 from tests.support.refusals import assert_refused
 
 SECTIONS = ["Learning curves", "On the test volumes", "Which is likely to be better", "Episodes", "Runs", "Numbers"]
@@ -54,12 +54,12 @@ def test_report_of_a_multirun_groups_its_jobs_and_has_every_number_beside_it(ans
     assert "All groups: with few seeds" in shown
     table = rows(folder / "runs.csv")
     assert [(row["group"], row["seed"], row["status"]) for row in table] == [
-        (f"agent={agent}", str(seed), "finished") for agent in ("sac", "ppo") for seed in range(3)
+        (group, str(seed), "finished") for group in GROUPS.values() for seed in range(3)
     ]
     final = {(row["group"], row["figure"]): row for row in rows(folder / "final.csv")}
-    for agent in ("sac", "ppo"):
+    for agent, group in GROUPS.items():
         of_seeds = [runs.client.get_run(run_id).data.metrics["test_volumes/mean_steps"] for run_id in runs.ids(agent)]
-        row = final[f"agent={agent}", "mean_steps"]
+        row = final[group, "mean_steps"]
         assert float(row["value"]) == pytest.approx(sum(of_seeds) / 3)
         assert float(row["low"]) <= float(row["value"]) <= float(row["high"])
     history = runs.client.get_metric_history(runs.ids("sac")[0], "validation/mean_return")
@@ -69,11 +69,11 @@ def test_report_of_a_multirun_groups_its_jobs_and_has_every_number_beside_it(ans
     ]
     curves = [row for row in rows(folder / "curves.csv") if row["figure"] == "validation/success_rate"]
     assert {(row["group"], row["axis"]) for row in curves} == {
-        (f"agent={agent}", axis) for agent in ("sac", "ppo") for axis in ("environment steps", "seconds of training")
+        (group, axis) for group in GROUPS.values() for axis in ("environment steps", "seconds of training")
     }
     pairs = rows(folder / "improvement.csv")
     assert [(row["figure"], row["better"], row["than"]) for row in pairs] == [
-        (figure, "agent=sac", "agent=ppo")
+        (figure, GROUPS["sac"], GROUPS["ppo"])
         for figure in ("on_plane_rate", "median_distance_mm", "success_rate", "mean_steps")
     ]
 
