@@ -13,6 +13,7 @@ from armscan.config.defaults import PHANTOM
 from armscan.config.error_messages import one_line_message
 from armscan.errors import InvalidValueError
 from armscan.evaluation.agent_source import EvaluatedAgent
+from armscan.tracking.tags import SUBJECTS, VOLUMES
 from armscan.training import PARTS, TEST, TRAINING, VALIDATION, Split, check_unchanged
 from armscan.utils.files import check_writable, sha256
 from armscan.volumes import LabelVolume, load_phantoms, open_dataset
@@ -116,7 +117,7 @@ def check_out(file: Path, out: Path | None, what: str) -> None:
 
 
 def known_volumes(source: EvaluatedAgent, groups: Mapping[str, VolumesByName]) -> list[str]:
-    """Return a sentence for each way in which an agent's run used these volumes, or others with their names.
+    """Return a sentence for each way in which an agent's run used these volumes, or others of their names or subjects.
 
     Args:
         source: Agent of a run.
@@ -136,10 +137,13 @@ def known_volumes(source: EvaluatedAgent, groups: Mapping[str, VolumesByName]) -
         if same:
             shown = (name if name == there else f"{name} (there {there})" for name, there in same.items())
             notes.append(f"{what} these volumes: {', '.join(shown)}")
-        names = had or source.run.tags.get(f"volumes.{part}", "").split(" ")
+        names = had or source.run.tags.get(f"{VOLUMES}{part}", "").split(" ")
+        subjects = source.run.tags.get(f"{SUBJECTS}{part}", "").splitlines()
         if others := [name for name in volumes if name in names and name not in same]:
             which = ", but with other voxels or another plane" if had else ""
             notes.append(f"{what} volumes of these names{which}: {', '.join(others)}")
+        if others := [name for name in volumes if volumes[name].subject in subjects and name not in (*same, *names)]:
+            notes.append(f"{what} other volumes of the same subjects as: {', '.join(others)}")
     return notes
 
 

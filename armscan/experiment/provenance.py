@@ -25,8 +25,8 @@ from armscan.tracking import (
     tags_of,
     upload_pending,
 )
-from armscan.tracking.tags import CHOICE, DOMAIN_TAG, FOLDER_TAG, HOST_TAG, JOB_TAG, VERSION_TAG
-from armscan.training import Fingerprints, TrainingDomain
+from armscan.tracking.tags import CHOICE, DOMAIN_TAG, FOLDER_TAG, HOST_TAG, JOB_TAG, SUBJECTS, VERSION_TAG, VOLUMES
+from armscan.training import TrainingDomain
 from armscan.utils.files import atomic_write, sha256
 from armscan.utils.run_files import (
     CONFIG_FILE,
@@ -84,7 +84,7 @@ def start_tracking(
             "seed": str(resolved["seed"]),
             "overrides": " ".join(invocation.overrides),
             **{f"{CHOICE}{group}": choices[group] for group in CHOICES_IN_TAGS},
-            **volume_tags(setup.fingerprints),
+            **volume_tags(setup),
             # On other volumes, an evaluation must reproduce the agent's observations.
             DOMAIN_TAG: TrainingDomain.of(setup.training_env, setup.smallest_slice_px).to_json(),
             **place_tags(invocation.folder),
@@ -126,13 +126,18 @@ def sha256_tags(files: Mapping[str, bytes]) -> dict[str, str]:
     return {tag: sha256(files[name]) for name, tag in SHA256_TAGS.items()}
 
 
-def volume_tags(prints: Fingerprints) -> dict[str, str]:
-    """Return the names of the volumes, each with the beginning of its fingerprint, as tags of a run."""
-    told = {
-        f"volumes.{part}": " ".join(f"{name}:{each[:N_PRINT_CHARS]}" for name, each in volumes.items())
-        for part, volumes in prints.items()
+def volume_tags(setup: Experiment) -> dict[str, str]:
+    """Return the names of the volumes, each with the beginning of its fingerprint, and subjects as tags of a run."""
+    names = {
+        f"{VOLUMES}{part}": " ".join(f"{name}:{each[:N_PRINT_CHARS]}" for name, each in volumes.items())
+        for part, volumes in setup.fingerprints.items()
     }
-    return tags_of(told, whole_in=VOLUMES_FILE)
+    subjects = {
+        f"{SUBJECTS}{part}": "\n".join(dict.fromkeys(volume.subject for volume in volumes.values() if volume.subject))
+        for part, volumes in setup.split.parts.items()
+    }
+    subjects = {tag: value for tag, value in subjects.items() if value}
+    return tags_of(names, whole_in=VOLUMES_FILE) | tags_of(subjects, whole_in="the manifest")
 
 
 def place_tags(folder: Path) -> dict[str, str]:

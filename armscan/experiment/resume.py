@@ -140,7 +140,7 @@ def resume_run(
         _check_volumes(run, folder, setup.fingerprints)
         agent = setup.agent
         earlier = resume_from_checkpoint(agent, folder, setup.provenance(run_id)) if isinstance(agent, Learner) else []
-        tags = volume_tags(setup.fingerprints) | place_tags(folder)
+        tags = volume_tags(setup) | place_tags(folder)
         tracked = TrackedRun.reopen(client, run, folder=folder, config=config, tags=tags)
         return run_tracked(setup, tracked, folder, client.uri, job_label=job_label, earlier=earlier)
 

@@ -10,6 +10,8 @@ VERSION_TAG = "armscan.version"
 # Prefix of the tags with a run's choice of each configuration group. Only trainings have them, not their parent runs.
 CHOICE = "choice."
 AGENT_TAG, OBS_TAG = f"{CHOICE}agent", f"{CHOICE}obs"
+# Prefixes of the tags with the volumes of a split, each with the beginning of its fingerprint, and their subjects.
+VOLUMES, SUBJECTS = "volumes.", "subjects."
 # What the agent of a run was trained on, as `armscan.training.TrainingDomain` writes it.
 DOMAIN_TAG = "trained_on"
 # The run that was evaluated; only evaluations have this tag.

@@ -80,6 +80,23 @@ def test_volumes_of_the_training_are_known_under_other_names_and_others_under_th
     assert f"or another plane: {third}\n" in printed
 
 
+def test_another_volume_of_a_subject_of_the_training_is_known(evaluate, tmp_path, wrists):
+    manifest = yaml.safe_load((wrists / "manifest.yaml").read_text())
+    one, _, _, last = manifest["volumes"]
+    manifest["volumes"][one]["subject"] = "anna"
+    manifest["splits"]["train"] = ["anna", *manifest["splits"]["train"][1:]]
+    (wrists / "manifest.yaml").write_text(yaml.safe_dump(manifest))
+    run_id = tracked(tmp_path, agent=GUESSER, **ON_FILES)
+    other = tmp_path / "other"
+    other.mkdir()
+    shutil.copy(wrists / last, other / "again.nii.gz")
+    entries = {"again.nii.gz": manifest["volumes"][last] | {"subject": "anna"}}
+    (other / "manifest.yaml").write_text(yaml.safe_dump({"volumes": entries}))
+    code, printed, errors = evaluate(run_id, "--trust", "--data=other", "--episodes=2")
+    assert (code, errors) == (0, "")
+    assert "note: the agent was trained on other volumes of the same subjects as: again.nii.gz\n" in printed
+
+
 def test_file_names_of_long_names_are_short_and_stay_apart():
     names = {file_name("random", f"{'v' * 230}{number}", "seed0") for number in range(3)}
     assert len(names) == 3

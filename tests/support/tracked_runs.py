@@ -10,9 +10,10 @@ from omegaconf import OmegaConf
 
 from armscan.config.compose import compose
 from armscan.experiment.build import build_experiment
+from armscan.experiment.provenance import volume_tags
 from armscan.tracking import TrackedRun
-from armscan.tracking.tags import DOMAIN_TAG
-from armscan.training import TrainingDomain, save_checkpoint
+from armscan.tracking.tags import DOMAIN_TAG, VOLUMES
+from armscan.training import TRAINING, TrainingDomain, save_checkpoint
 from armscan.utils.files import sha256
 from armscan.utils.run_files import SHA256_TAGS
 from tests.support import FEW_VOLUMES
@@ -61,7 +62,9 @@ def tracked(folder, *overrides, agent=None, kept=("config.yaml", "volumes.json",
     (folder / "config.yaml").write_text(yaml.safe_dump(OmegaConf.to_container(config)))
     (folder / "volumes.json").write_text(json.dumps(experiment.split.fingerprints()))
     tags = {SHA256_TAGS[name]: sha256((folder / name).read_bytes()) for name in SHA256_TAGS if name in kept}
-    tags |= {"volumes.training": " ".join(experiment.split.training), "working_folder": str(folder)}
+    # Runs without fingerprints are of earlier versions, which had the names alone in this tag.
+    tags |= volume_tags(experiment) | {f"{VOLUMES}{TRAINING}": " ".join(experiment.split.training)}
+    tags |= {"working_folder": str(folder)}
     tags |= {DOMAIN_TAG: domain.to_json()} if has_tag else {}
     with TrackedRun.start(client, experiment_id, name="tiny", config={}, tags=tags, folder=folder) as run:
         if agent is None:

@@ -205,7 +205,7 @@ def _start_or_resume(
             # The trial can always start again, with an untrained agent.
             setup = set_up(config)
         else:
-            tags = {**volume_tags(setup.fingerprints), **place_tags(folder), **attempt.tags}
+            tags = {**volume_tags(setup), **place_tags(folder), **attempt.tags}
             tags[PARENT_TAG] = attempt.run_id
             return setup, TrackedRun.reopen(client, run, folder=folder, config=to_plain(config), tags=tags), earlier
     job = Job(attempt.trial.number, " ".join(attempt.overrides), "", attempt.run_id, attempt.study_folder)
