@@ -51,7 +51,7 @@ class MarkupError(ArmscanError, ValueError):
 
 
 class OptimalPlaneError(ArmscanError, ValueError):
-    """A volume's labelled optimal plane is missing, out of bounds, or does not show the landmarks."""
+    """A volume's labelled plane is missing, out of bounds, or does not show the landmarks."""
 
 
 class ResetNeededError(ArmscanError, RuntimeError):

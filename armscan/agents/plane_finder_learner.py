@@ -29,7 +29,7 @@ from armscan.utils.arrays import FloatArray
 PHANTOM = re.compile(r"phantom-[\w-]+")
 # Perturbed looks: range of the standard deviations, in mm and degrees, which are drawn log-uniformly.
 ASTRAY_MM, ASTRAY_DEG = (0.5, 6.0), (1.0, 8.0)
-# Factors on the loss thresholds for the first look: normal, normal, along it, across.
+# Factors on the loss thresholds for the first look: two tilts, distance along the normal, position across.
 FIRST_LOOK = (2.0, 2.0, 5.0, 1.0)
 # Weight of the second head's loss relative to the first's.
 EXPECTED_ERROR_WEIGHT = 0.1

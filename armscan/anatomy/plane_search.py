@@ -42,8 +42,8 @@ class FoundPlane:
         score: Reward of the plane, in [-1, 0].
         counts: Number of clusters of bones, tendons and artery in its slice.
         spread: Extent of the largest connected region of planes with the best score, end to end: (rz, rx) in degrees
-            and along the arm in mm; None for a plane that a person drew.
-        is_cut: Whether that region reaches a limit of the search, beyond which it may go on. Default: False.
+            and along the arm in mm; None for a plane of a person or an agent.
+        is_cut: Whether that region reaches the limit of rz or rx, beyond which it may go on. Default: False.
     """
 
     action: ManipulatorAction

@@ -31,7 +31,7 @@ class Reward(Protocol):
         """
 
     def score(self, landmarks: Landmarks, pixel_mm: tuple[float, float]) -> float:
-        """Return the reward, in [-1, 0], of a slice with this summary and pixels of this size, (across, depth)."""
+        """Return the reward, in [-1, 0], of a slice with this summary and pixels of (across, depth) mm."""
 
 
 class LandmarkReward:
@@ -42,8 +42,8 @@ class LandmarkReward:
     single artery in depth.
 
     Args:
-        targets: Target counts: clusters of bones, tendons and artery that the wanted plane shows. (4, 3, 1), or (7, 5,
-            1) in the other published description.
+        targets: Target counts: clusters of bones, tendons and artery that the wanted plane shows; (7, 5, 1) in the
+            other published description. Default: (4, 3, 1).
 
     Raises:
         InvalidValueError: If `targets` is not three whole numbers from 1 to 1000.
@@ -69,22 +69,23 @@ class LandmarkReward:
 class AgreementReward(LandmarkReward):
     """The mean of the published reward and the agreement of sizes and positions with the labelled planes.
 
-    The published reward is 0 up to 10 mm and 15 degrees away from a labelled plane. The agreement rates seven features
-    of a slice: the clustered area of each tissue, and how far the mean centres of tendons and artery are from the
-    bones', across and in depth. A feature costs nothing inside the range that the labelled planes of the training
+    The published reward can be 0 as far as 10 mm or 15 degrees from a labelled plane. The agreement rates seven
+    features of a slice: the clustered area of each tissue, and how far the mean centres of tendons and artery are from
+    the bones', across and in depth. A feature costs nothing inside the range that the labelled planes of the training
     volumes span; outside, its cost rises to at most 1. The agreement is minus the mean cost: 0 on each of these planes.
 
     Distances are unsigned and between tissues, so that they are the same for left and right hands, and do not change
     when the slice is shifted.
 
     Args:
-        targets: Target counts of the published reward.
+        targets: Target counts of the published reward. Default: (4, 3, 1).
         area_tolerance: Distance outside its range at which an area costs 1, as a fraction of the nearer end, from 0.001
-            to 1000.
+            to 1000. Default: 0.5.
         distance_tolerance_mm: Distance outside its range, in mm, at which a distance costs 1, from 0.001 to 1000.
-        slack: Fraction of each end by which the range of an area is widened, from 0 to 1, because the pixels of one
-            plane differ slightly between motions of the volume.
-        slack_mm: Width in mm by which the range of a distance is widened at both ends, from 0 to 1000.
+            Default: 5.
+        slack: Widening of an area's range at each end, as a fraction of that end, from 0 to 1: the pixels of one plane
+            differ slightly between motions of the volume. Default: 0.1.
+        slack_mm: Widening of a distance's range at each end, in mm, from 0 to 1000. Default: 0.5.
     """
 
     def __init__(
@@ -156,14 +157,14 @@ class AgreementReward(LandmarkReward):
         if not isinstance(volume, LabelVolume):
             raise InvalidValueError(f"volumes holds {volume!r}, but each must be a LabelVolume")
         if volume.optimal_action is None:
-            raise OptimalPlaneError(f"{volume.name}: has no labelled optimal plane, which the reward is fitted to")
+            raise OptimalPlaneError(f"{volume.name}: has no labelled plane, which the reward is fitted to")
         slice_xz = volume.slice(volume.optimal_action)
         clusters = TissueClusters.from_slice(slice_xz, tissues, volume.pixel_mm)
         features = _features(clusters.landmarks, volume.pixel_mm)
         known = [feature for feature in features if feature is not None]
         if len(known) < len(features):
             raise OptimalPlaneError(
-                f"{volume.name}: the labelled optimal plane shows {clusters.counts} clusters of bones, tendons and "
+                f"{volume.name}: the labelled plane shows {clusters.counts} clusters of bones, tendons and "
                 "artery, but a reward can only be fitted to planes that show each of them"
             )
         return known

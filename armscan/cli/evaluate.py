@@ -74,7 +74,7 @@ OPTIONS = {
 @click.option(
     "--success-threshold",
     type=click.FloatRange(0, 1, min_open=True),
-    help="End an episode when its reward is above minus this value.",
+    help="Threshold of success: an episode succeeds if its reward is above minus this value.",
 )
 @click.option("--max-steps", type=click.IntRange(1), help="Steps after which an episode is truncated.")
 @click.option("--start", type=click.Choice(["middle", "random"]), help="Where episodes start.")

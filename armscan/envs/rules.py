@@ -227,7 +227,7 @@ class Rules:
             if score <= -self.success_threshold:
                 counts = tuple(landmarks[:, 0].astype(int).tolist())
                 raise OptimalPlaneError(
-                    f"{volume.name}: the labelled optimal plane scores {score:.3f} (bones, tendons, artery: {counts}), "
+                    f"{volume.name}: the labelled plane scores {score:.3f} (bones, tendons, artery: {counts}), "
                     f"but it must score above -success_threshold = {-self.success_threshold:g}"
                 )
 

@@ -41,6 +41,7 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
 
     Raises:
         InvalidValueError: If an argument is invalid.
+        OptimalPlaneError: As `ArmscanEnv`.
     """
 
     metadata: dict[str, Any]

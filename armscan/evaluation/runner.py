@@ -98,7 +98,7 @@ def prepare_agent(
         data: Folder of volumes, `phantom` for new phantoms of the version in the agent's configuration, or None for
             the volumes of that configuration.
         n_phantoms: Number of phantoms, 1 or more; used for `phantom` only.
-        check: Function that raises an error if the volumes, by their labels, do not suit the caller.
+        check: Function that raises an error if the groups of volumes, by name, do not suit the caller.
         render_mode: Gymnasium render mode of the environments. Default: None.
 
     Raises:

@@ -117,7 +117,7 @@ def facts_of(config: Mapping[str, Any], env: Env, run_id: str, slice_px: tuple[i
     if rules["translation_bounds_mm"] is not None:
         ways = dict(zip(ways, rules["translation_bounds_mm"], strict=True))
     turns = zip(("rz", "rx"), rules["rotation_bounds_deg"], strict=True)
-    means = {name: f"times {bound} degrees" for name, bound in turns}
+    means = {name: f"a times {bound} degrees" for name, bound in turns}
     means |= {name: f"(a + 1) / 2 times {bound}, in mm" for name, bound in ways.items()}
     means[STOP] = "above 0: the episode ends with this plane"
     return {

@@ -55,7 +55,7 @@ OLDER = {
 TITLES = {
     **{each.metric: each.title for each in (*QUANTITIES, *OLDER)},
     "mean_return": "return, mean",
-    "mean_final_reward": "reward of the last plane, mean",
+    "mean_final_reward": "final reward, mean",
     "mean_best_reward": "best reward, mean",
     "env_steps": "environment steps",
     "training_s": "training, s",

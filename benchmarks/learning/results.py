@@ -67,10 +67,10 @@ def _presets() -> dict[str, Row]:
         "best_ppo_zy": ("2-DoF (zy), PPO", 0.98, 2.5, 8),
         "best_ppo_full": ("4-DoF (full), PPO", 0.98, 2.5, 8),
         "best_full_exact": ("4-DoF, SAC, success threshold 0.01", 0.98, 3.0, 15),
-        "best_full_images": ("4-DoF, images alone, SAC", 0.97, 3.0, 60),
+        "best_full_images": ("4-DoF, images, SAC", 0.97, 3.0, 60),
         "best_zy_published_observation": ("2-DoF, actions and rewards alone, SAC, sampling", 0.97, 6.0, 15),
         "best_full_distance": ("4-DoF, SAC, reward=agreement", None, None, None),
-        "best_full_taught": ("4-DoF, taught with labelled planes, reward=agreement", None, None, None),
+        "best_full_taught": ("4-DoF, trained on labelled planes, reward=agreement", None, None, None),
     }
     return {name: Row(title, (f"experiment={name}",), *limits) for name, (title, *limits) in wanted.items()}
 

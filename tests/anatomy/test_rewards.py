@@ -123,9 +123,9 @@ def test_agreement_reward_needs_labelled_planes_that_show_every_tissue(dataset):
     volume = next(iter(dataset.values()))
     unlabelled = LabelVolume(volume.labels, volume.spacing, "unlabelled")
     elsewhere = LabelVolume(volume.labels, volume.spacing, "elsewhere", ManipulatorAction((0, 0), (0, 5000)))
-    with pytest.raises(OptimalPlaneError, match="unlabelled: has no labelled optimal plane"):
+    with pytest.raises(OptimalPlaneError, match="unlabelled: has no labelled plane"):
         AgreementReward().fit([unlabelled])
-    with pytest.raises(OptimalPlaneError, match=r"elsewhere: the labelled optimal plane shows \(0, 0, 0\)"):
+    with pytest.raises(OptimalPlaneError, match=r"elsewhere: the labelled plane shows \(0, 0, 0\)"):
         AgreementReward().fit([elsewhere])
     with pytest.raises(InvalidValueError, match="volumes is empty"):
         AgreementReward().fit([])

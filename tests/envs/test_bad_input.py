@@ -250,7 +250,7 @@ def test_a_volume_of_one_voxels_thickness_is_played_on(axis, observation):
     assert env.observation_space.contains(observed)
     np.testing.assert_array_equal(env.slice_xz, labels[:, 0])
     assert not volume.slice(ManipulatorAction((0.0, 0.0), (0.0, 30.0))).any()
-    with pytest.raises(OptimalPlaneError, match="thin: the labelled optimal plane scores -"):
+    with pytest.raises(OptimalPlaneError, match="thin: the labelled plane scores -"):
         ArmscanEnv([volume], transform=None)
 
 

@@ -334,7 +334,7 @@ def test_env_fits_a_reward_to_its_volumes_and_leaves_the_one_given_as_it_is(wris
 
 
 def test_env_refuses_volumes_that_do_not_show_the_other_published_targets(wrist):
-    with pytest.raises(OptimalPlaneError, match=r"wrist: the labelled optimal plane scores -0\.\d+"):
+    with pytest.raises(OptimalPlaneError, match=r"wrist: the labelled plane scores -0\.\d+"):
         ArmscanEnv([wrist], targets=(7, 5, 1))
     assert ArmscanEnv([wrist], targets=(7, 5, 1), success_threshold=0.2).reset(seed=0)
 

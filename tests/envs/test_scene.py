@@ -199,13 +199,13 @@ def test_random_transform_refuses_impossible_limits(bad):
 
 
 def test_task_refuses_a_volume_without_a_labelled_plane():
-    with pytest.raises(OptimalPlaneError, match="tiny: has no labelled optimal plane"):
+    with pytest.raises(OptimalPlaneError, match="tiny: has no labelled plane"):
         make_rules(make_tiny_volume())
 
 
 def test_task_refuses_a_plane_that_does_not_score():
     volume = make_tiny_volume(optimal_action=ManipulatorAction((0, 0), (0, 5)))
-    with pytest.raises(OptimalPlaneError, match=r"tiny: the labelled optimal plane scores -0\.\d+"):
+    with pytest.raises(OptimalPlaneError, match=r"tiny: the labelled plane scores -0\.\d+"):
         make_rules(volume)
 
 

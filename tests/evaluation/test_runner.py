@@ -60,7 +60,7 @@ def test_labelled_planes_that_score_too_little_are_refused_with_what_may_be_the_
     ):
         code, _, errors = evaluate(run_id, f"--data={coarse_folder}", "--episodes=2", word)
         assert code == 2
-        assert errors.startswith("error: b.nii.gz: the labelled optimal plane scores")
+        assert errors.startswith("error: b.nii.gz: the labelled plane scores")
         assert errors.endswith(ending)
 
 

@@ -252,7 +252,7 @@ def test_run_keeps_its_policy_or_says_why_not_and_finishes(regression, tmp_path,
         said = yaml.safe_load((folder / "policy" / "MLmodel").read_text())["metadata"]
         assert said["run"] == tracked.run_id
         assert said["observation"][1]["crop"] == [90, 80]
-        assert said["action"] == {"rz": "times 90.0 degrees", "ty": "(a + 1) / 2 times 300.0, in mm"}
+        assert said["action"] == {"rz": "a times 90.0 degrees", "ty": "(a + 1) / 2 times 300.0, in mm"}
 
 
 def test_run_keeps_no_policy_where_its_configuration_says_so(regression, tmp_path):
