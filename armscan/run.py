@@ -145,13 +145,15 @@ def main() -> int:
         return 1
     except (KeyboardInterrupt, Exception) as error:
         # An interrupt inside compiled code can surface as any other error.
-        if is_interruption(error):
-            _end_interrupted()
-            print(INTERRUPTED, file=sys.stderr)
-            return 130
-        end_multirun()
-        raise_or_exit(error)
-    return end_multirun()
+        if not is_interruption(error):
+            end_multirun()
+            raise_or_exit(error)
+    else:
+        return end_multirun()
+    # Not in the handler, where every further error would seem to follow from the interruption.
+    _end_interrupted()
+    print(INTERRUPTED, file=sys.stderr)
+    return 130
 
 
 if __name__ == "__main__":

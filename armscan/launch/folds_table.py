@@ -107,13 +107,16 @@ def keep_table(
     text = page("all folds (test)", f"{table.html()}<h2>Jobs</h2>{jobs.html()}", notes=notes)
     atomic_write(file, text)
     time_ms = now_ms()
-    groups = {title: metric_prefix(title.removesuffix(ALL_FOLDS)) for title in table.results} | {AGENT: TEST_METRICS}
+    # If runs also differ in other settings, or folds are missing, only the page has their figures.
+    groups = {
+        title: TEST_METRICS if title == AGENT else metric_prefix(title.removesuffix(ALL_FOLDS))
+        for title in table.results
+        if title.endswith(ALL_FOLDS)
+    }
     shown = [*(column.metric for column in table.quantities), ABOVE_RANDOM]
     metrics = [
         Metric(f"{group}/{name}", value, time_ms, 0)
         for title, group in groups.items()
-        # If runs also differ in other settings, or folds are missing, only the page has their figures.
-        if title.endswith(ALL_FOLDS)
         for name, value in table.results[title].shown_metrics(shown).items()
         if math.isfinite(value)
     ]

@@ -9,11 +9,13 @@ import contextlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
-from armscan.config.defaults import to_plain
+from armscan.config.defaults import FOLD, to_plain
+from armscan.config.task import is_under
 from armscan.config.trust import check_composed
 from armscan.experiment.build import check_keys, set_up
 from armscan.experiment.job import Invocation, Job
@@ -21,9 +23,11 @@ from armscan.experiment.provenance import provenance_files, sha256_tags
 from armscan.experiment.results import LAST_VALIDATION, figures_of
 from armscan.experiment.resume import resume_run
 from armscan.experiment.runner import run_experiment
-from armscan.tracking import TrackingStore, open_store
+from armscan.tracking import TrackingStore, load_run, open_store
+from armscan.tracking.sanitize import params_of
 from armscan.tracking.tags import FOLDER_TAG, GRID_TAG, JOB_TAG, PARENT_TAG, STUDY_TAG
-from armscan.utils.run_files import LAST_CHECKPOINT
+from armscan.training import Fingerprints, check_unchanged
+from armscan.utils.run_files import LAST_CHECKPOINT, SHA256_TAGS, VOLUMES_FILE
 
 if TYPE_CHECKING:
     from mlflow.entities import Run
@@ -40,6 +44,8 @@ def run_again(config: DictConfig, invocation: Invocation, job: Job) -> Metrics:
     setup = set_up(config)
     client, experiment_id = open_store(**resolved["tracking"])
     earlier = earlier_runs(client, experiment_id, sha256_tags(provenance_files(resolved, setup)), job)
+    if not any(run.data.tags.get(PARENT_TAG) == job.repeats for run in earlier):
+        _check_volumes(client, experiment_id, params_of(resolved), setup.fingerprints, job)
     for run in earlier:
         if run.info.status == "FINISHED":
             print(f"[{job.label}] has finished before: run {run.info.run_id}", flush=True)
@@ -75,6 +81,31 @@ def earlier_runs(client: TrackingStore, experiment_id: str, sums: Mapping[str, s
     kin = {grid for grid in words if words[grid] == words.get(job.parent_run_id)} | {job.repeats, None}
     own = [run for run in found if run.info.run_id in parents and parents[run.info.run_id] in kin]
     return sorted(own, key=lambda run: parents[run.info.run_id] != job.repeats)
+
+
+def _check_volumes(
+    client: TrackingStore, experiment_id: str, params: Mapping[str, str], now: Fingerprints, job: Job
+) -> None:
+    """Raise `ChangedVolumesError` if the repeated grid has a run on the same data whose volumes, in all, were others.
+
+    The folds of a cross-validation have the same volumes, in other parts; another subject would be another fold.
+    """
+    assert job.repeats is not None
+    for run in client.children(experiment_id, job.repeats):
+        if SHA256_TAGS[VOLUMES_FILE] in run.data.tags and _data_in(run.data.params) == _data_in(params):
+            with TemporaryDirectory() as folder:
+                then = load_run(client.uri, run.info.run_id).volumes(Path(folder))
+            assert then is not None
+            check_unchanged({"grid's": _joined(then)}, {"grid's": _joined(now)}, f"run {run.info.run_id} of it had")
+            return
+
+
+def _data_in(params: Mapping[str, str]) -> dict[str, str]:
+    return {key: value for key, value in params.items() if is_under(key, ("data",)) and key != FOLD}
+
+
+def _joined(prints: Fingerprints) -> dict[str, str]:
+    return {name: each for volumes in prints.values() for name, each in volumes.items()}
 
 
 def _words_of(grid: Run) -> set[str]:

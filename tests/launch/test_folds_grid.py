@@ -179,6 +179,27 @@ def test_page_and_description_of_all_folds_say_what_is_missing(tmp_path, databas
     assert store.get_run(run_id).data.tags[DESCRIPTION_TAG].startswith("1 of 2 jobs are missing\n\n")
 
 
+@pytest.mark.parametrize(
+    ("varied", "n_folds", "tracked"),
+    [
+        (["data.fold=0"], 1, {"test_volumes", "random"}),
+        # Their figures are in the page alone.
+        (["data.fold=0"], 2, set()),
+        (["data.fold=0 agent=sac", "data.fold=0 agent=ppo"], 1, set()),
+    ],
+)
+def test_grid_has_the_metrics_of_all_folds_alone(tmp_path, database, varied, n_folds, tracked):
+    store, experiment_id = store_in(tmp_path, "a")
+    run_id = store.create_run(experiment_id, name="grid", tags={}).info.run_id
+    runs = [(left_by_a_run(tmp_path / str(i), "wrist", [1.0]), words.split()) for i, words in enumerate(varied)]
+    jobs = jobs_table({"0": JobOutcome("", "data.fold=0", metrics={})}, {}, have_same_task=False)
+    keep_table(folds_table(runs, n_folds), jobs, tmp_path, store, run_id, [])
+    run = store.get_run(run_id)
+    assert {key.split("/")[0] for key in run.data.metrics} == tracked
+    assert DESCRIPTION_TAG in run.data.tags
+    assert [file.path for file in store.list_artifacts(run_id)] == [RESULTS_PAGE]
+
+
 def test_no_job_is_the_best_of_those_that_are_tested_on_other_wrists():
     outcomes = {
         str(fold): JobOutcome("", f"data.fold={fold}", metrics={TEST: {"on_plane_5mm_10deg": rate}})

@@ -35,6 +35,22 @@ def test_second_interrupt_leaves_the_command_that_resumes_the_grid(tmp_path, mon
     assert f"resume={'a' * 32} tracking.uri=sqlite:///mine.db" in told
 
 
+def test_error_while_an_interrupted_grid_is_closed_is_shown(monkeypatch):
+    def interrupt(_):
+        raise KeyboardInterrupt
+
+    def fail(**_):
+        raise LookupError("of the end")
+
+    monkeypatch.setattr(run, "launch", interrupt)
+    monkeypatch.setattr(run, "end_multirun", fail)
+    monkeypatch.setattr("sys.argv", ["armscan.run", "seed=1"])
+    # The command sets it, and would take it for the user's setting the next time.
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
+    with pytest.raises(LookupError, match="of the end"):
+        run.main()
+
+
 def test_job_that_was_stopped_alone_has_not_failed(tmp_path, database, monkeypatch, capsys):
     store, experiment_id = store_in(tmp_path, "a")
     parent = store.create_run(experiment_id, name="multirun", tags={}).info.run_id

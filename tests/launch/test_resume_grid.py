@@ -5,11 +5,17 @@ import json
 import pytest
 
 from armscan.config.compose import compose
-from armscan.errors import UntrustedError
+from armscan.config.defaults import to_plain
+from armscan.errors import ChangedVolumesError, UntrustedError
+from armscan.experiment.build import build_experiment
 from armscan.experiment.job import Invocation, Job
 from armscan.launch.resume_grid import earlier_runs, run_again
+from armscan.tracking import TrackedRun
 from armscan.tracking.tags import GRID_TAG, PARENT_TAG, STUDY_TAG
+from armscan.utils.files import sha256
+from armscan.utils.run_files import SHA256_TAGS, VOLUMES_FILE
 from tests.support.stores import store_in
+from tests.support.tracked_runs import FEW
 
 SUMS = {"config.sha256": "a", "volumes.sha256": "b"}
 
@@ -39,6 +45,38 @@ def test_earlier_run_is_of_the_repeated_grid_and_never_of_a_study_or_another_gri
     found = [run.info.run_id for run in earlier_runs(client, experiment_id, SUMS, job)]
     assert found[0] == ours
     assert {*found} == {ours, alone, of_repetition}
+
+
+@pytest.mark.parametrize("change", ["new", "changed", None])
+def test_grid_goes_on_with_the_same_volumes_alone(tmp_path, database, change):
+    words = [*FEW, f"tracking.uri=sqlite:///{tmp_path}/mlruns.db"]
+    config = compose([*words, "seed=1"])
+    client, experiment_id = store_in(tmp_path, config.tracking.experiment)
+    # Another job of the grid, on the same volumes.
+    prints = build_experiment(config).split.fingerprints()
+    (name,) = prints["test"]
+    if change == "new":
+        prints["test"] = {}
+    elif change == "changed":
+        prints["test"][name] = "0" * 64
+    record = json.dumps(prints).encode()
+    (tmp_path / VOLUMES_FILE).write_bytes(record)
+    tags = {PARENT_TAG: "1" * 32, SHA256_TAGS[VOLUMES_FILE]: sha256(record)}
+    with TrackedRun.start(
+        client, experiment_id, name="0", config=to_plain(compose(words)), tags=tags, folder=tmp_path
+    ) as run:
+        run.log_files(tmp_path / VOLUMES_FILE)
+    job = Job(1, "", "", "2" * 32, tmp_path, repeats="1" * 32, is_trusted=False)
+    begun = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("armscan.launch.resume_grid.run_experiment", lambda *_: begun.append(1))
+        if change is None:
+            run_again(config, Invocation(tmp_path, [], "", {}, job), job)
+        else:
+            what = f"the grid's volumes are not those that run {run.run_id} of it had: {name} is {change}"
+            with pytest.raises(ChangedVolumesError, match=what):
+                run_again(config, Invocation(tmp_path, [], "", {}, job), job)
+    assert bool(begun) == (change is None)
 
 
 def test_job_of_a_stored_command_line_builds_no_class_of_others(tmp_path):
