@@ -21,7 +21,7 @@ from armscan.config.trust import check_artifact_address
 from armscan.errors import TrackingError
 from armscan.tracking.tracking_store import TrackingStore, reason_in
 from armscan.tracking.view import VIEW, VIEW_TAG
-from armscan.utils.files import SQLITE_PREFIX, check_writable, nearest_existing, sqlite_file
+from armscan.utils.files import SQLITE_PREFIX, check_writable, create_database, nearest_existing, sqlite_file
 from armscan.utils.validation import check_bool, check_float
 
 EXAMPLES = {"uri": "sqlite:///mlruns.db", "experiment": "armscan", "artifacts": "mlartifacts"}
@@ -91,6 +91,7 @@ def open_store(
         # at the same time, which destroys the database (https://sqlite.org/howtocorrupt.html, section 2.2).
         check_writable(database)
         with FileLock(f"{database}.lock", timeout=LOCK_TIMEOUT_S):
+            create_database(database, _create_tables)
             store = connected(f"{SQLITE_PREFIX}{database}")
             return store, _experiment_in(store, experiment, artifacts)
 
@@ -123,6 +124,15 @@ def open_existing_store(uri: str) -> TrackingStore:
         store = _store(uri, wait_s=DEFAULT_WAIT_S)
         store.search_experiments(max_results=1)
         return store
+
+
+def _create_tables(database: Path) -> None:
+    from mlflow.store.db.utils import _initialize_tables
+    from sqlalchemy import URL, create_engine
+
+    engine = create_engine(URL.create("sqlite", database=str(database)))
+    _initialize_tables(engine)
+    engine.dispose()
 
 
 def _check_is_store(uri: str, database: Path) -> None:

@@ -79,16 +79,16 @@ def _synced(files: Iterable[Path], opened: Callable[[str], TrackingStore], *, tr
         try:
             with contextlib.closing(Outbox(file, timeout_s=0.0)) as outbox:
                 run_id, uri = outbox.address.run_id, outbox.address.uri
-                if outbox.status not in ENDED and _is_dead(run_id, file):
-                    outbox.add(tags={FAILURE_TAG: PROCESS_DIED})
-                    outbox.add(status=("FAILED", now_ms()))
-                if outbox.is_uploaded:
+                is_open = outbox.status not in ENDED and _is_dead(run_id, file)
+                if outbox.is_uploaded and not is_open:
                     continue
-                if isinstance(store := stores.get(uri) or _opened(opened, uri), TrackingError):
+                store = stores[uri] = stores.get(uri) or _opened(opened, uri)
+                if is_open:
+                    _end(outbox, store)
+                if isinstance(store, TrackingError):
                     uploads.append(Upload(outbox.folder, run_id, 0, str(store)))
                 else:
                     uploads.append(_upload_of(outbox, store, trust=trust))
-                stores[uri] = store
         except FileNotFoundError:
             if _is_dead(file.stem, file) and (left := _end_removed(file.stem, opened)) is not None:
                 uploads.append(Upload(file.parent.parent, file.stem, 0, left))
@@ -103,6 +103,19 @@ def _is_dead(run_id: str, file: Path) -> bool:
     """Return whether the process that wrote this outbox of a run has died on this machine."""
     note = Note.of(run_id)
     return note is not None and note.is_dead and note.outbox.resolve() == file.resolve()
+
+
+def _end(outbox: Outbox, store: TrackingStore | TrackingError) -> None:
+    """Add the end of a run whose process died: FAILED, unless the store has another, as an interrupted grid's jobs."""
+    if isinstance(store, TrackingStore):
+        # Any error of the store: the upload reports it.
+        with contextlib.suppress(Exception):
+            told = store.get_run(outbox.address.run_id).info
+            if told.status in ENDED:
+                outbox.add(status=(told.status, told.end_time or now_ms()))
+                return
+    outbox.add(tags={FAILURE_TAG: PROCESS_DIED})
+    outbox.add(status=("FAILED", now_ms()))
 
 
 def _end_removed(run_id: str, opened: Callable[[str], TrackingStore]) -> str | None:

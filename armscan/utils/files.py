@@ -11,6 +11,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from secrets import token_hex
+from tempfile import TemporaryDirectory
 from typing import BinaryIO
 
 import platformdirs
@@ -63,6 +64,22 @@ def atomic_write(
         _sync_folder(path.parent)
     finally:
         unfinished.unlink(missing_ok=True)
+
+
+def create_database(file: Path, make: Callable[[Path], object]) -> None:
+    """Create a SQLite database elsewhere and move it to its place whole, if there is no file or an empty one.
+
+    A library cannot use tables that it was creating when the process was killed.
+
+    Args:
+        file: File of the database.
+        make: Function that creates the tables in a new file, and closes it.
+    """
+    if not file.exists() or not file.stat().st_size:
+        with TemporaryDirectory() as folder:
+            made = Path(folder) / "new.db"
+            make(made)
+            atomic_write(file, made.read_bytes(), follow_link=True)
 
 
 def _place(path: Path, *, follow_link: bool) -> Path:

@@ -70,6 +70,17 @@ def test_run_that_was_killed_is_ended_by_the_next_process(uri, run_id, tmp_path,
     assert ending_of(uri, run_id) == ("FAILED", FOLDER_REMOVED if is_removed else PROCESS_DIED)
 
 
+def test_end_that_the_store_has_already_stays(uri, run_id, tmp_path):
+    store = open_existing_store(uri)
+    store.set_tag(run_id, "failure", "interrupted")
+    store.set_terminated(run_id, "KILLED")
+    ended_ms = store.get_run(run_id).info.end_time
+    _upload_pending(store)
+    assert not any(upload.left for upload in sync(tmp_path, open_existing_store))
+    assert ending_of(uri, run_id) == ("KILLED", "interrupted")
+    assert store.get_run(run_id).info.end_time == ended_ms
+
+
 @pytest.mark.parametrize("is_removed", [False, True])
 @pytest.mark.parametrize(
     "changed", [{"host": "elsewhere"}, {"boot": "another"}, {"pid_namespace": "another"}, asdict(ProcessInfo.current())]

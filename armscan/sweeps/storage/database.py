@@ -7,6 +7,7 @@ import sqlite3
 import threading
 from collections.abc import Callable
 from functools import partial, wraps
+from pathlib import Path
 from typing import Any, TypeVar
 
 from optuna.distributions import BaseDistribution
@@ -151,6 +152,11 @@ def open_database(uri: str, *, retry: bool = False) -> DatabaseStorage:
     retry_policy = RetryPolicy("the storage", f"study.storage is {uri!r}", unavailable_reason, StorageUnavailableError)
     opened = partial(_opened, database_url(uri, STORAGE_PASSWORD))
     return DatabaseStorage(retry_policy.call(opened) if retry else opened(), retry_policy)
+
+
+def create_tables(file: Path) -> None:
+    """Create Optuna's tables in a new SQLite file."""
+    RDBStorage(URL.create("sqlite", database=str(file)).render_as_string()).engine.dispose()
 
 
 def tables_in(url: URL) -> list[str]:

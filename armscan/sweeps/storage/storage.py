@@ -17,9 +17,9 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from armscan.config.credentials import STORAGE_PASSWORD, check_address, database_url, mask_passwords
 from armscan.errors import MAX_REASON_CHARS, StorageUnavailableError, StudyError, in_one_line
-from armscan.sweeps.storage.database import DatabaseStorage, open_database, tables_in
+from armscan.sweeps.storage.database import DatabaseStorage, create_tables, open_database, tables_in
 from armscan.sweeps.storage.journal import CheckedJournal, open_journal
-from armscan.utils.files import SQLITE_PREFIX, sqlite_file
+from armscan.utils.files import SQLITE_PREFIX, create_database, sqlite_file
 
 T = TypeVar("T")
 # Some of Optuna's tables.
@@ -96,6 +96,8 @@ def open_storage(uri: str, *, where: str = "study.storage", retry: bool = False)
         _lock_file_of(file).touch()
         # Processes that create the tables of a new file at the same time would conflict.
         with FileLock(_lock_file_of(file)):
+            if uri.startswith(SQLITE_PREFIX):
+                create_database(file, create_tables)
             return _in_file(uri, file, is_written=True)
 
 

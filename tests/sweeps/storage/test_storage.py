@@ -110,6 +110,21 @@ def test_storage_refuses_a_database_of_somebody_else_and_leaves_it_as_it_is(tmp_
         assert connection.execute("SELECT name FROM sqlite_master").fetchall() == [(table,)]
 
 
+def test_storage_whose_tables_were_being_created_when_it_was_interrupted_is_created_anew(tmp_path, monkeypatch):
+    uri = f"sqlite:///{tmp_path}/a.db"
+
+    def begin(file):
+        with closing(sqlite3.connect(file)) as connection:
+            connection.execute("CREATE TABLE studies (a)")
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("armscan.sweeps.storage.storage.create_tables", begin)
+        with pytest.raises(KeyboardInterrupt):
+            open_storage(uri)
+    assert open_storage(uri).study_names == []
+
+
 def test_storage_that_is_looked_at_is_not_made(storage_uri, tmp_path):
     assert existing_storage(storage_uri) is None
     assert [file for file in tmp_path.iterdir() if file.name.startswith("a.")] == []
