@@ -127,12 +127,11 @@ def open_existing_store(uri: str) -> TrackingStore:
 
 
 def _create_tables(database: Path) -> None:
-    from mlflow.store.db.utils import _initialize_tables
-    from sqlalchemy import URL, create_engine
+    from mlflow.db import upgrade
 
-    engine = create_engine(URL.create("sqlite", database=str(database)))
-    _initialize_tables(engine)
-    engine.dispose()
+    # Not as a command, which turns an interrupt into an error of its own.
+    assert upgrade.callback is not None
+    upgrade.callback(f"{SQLITE_PREFIX}{database}")
 
 
 def _check_is_store(uri: str, database: Path) -> None:
