@@ -9,7 +9,7 @@ import re
 import shutil
 import sys
 import textwrap
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 # Maximum length of a library's error text in a message.
 MAX_REASON_CHARS = 300
@@ -114,13 +114,16 @@ class StorageUnavailableError(StudyError, ServiceUnavailableError):
     """The storage of a study is unavailable, and is not retried any further."""
 
 
-def is_interruption(error: BaseException | None) -> bool:
-    """Return whether an error is or follows from a `KeyboardInterrupt`, which compiled code can turn into any error."""
+def with_causes(error: BaseException | None) -> Iterator[BaseException]:
+    """Yield an error, and those that it follows from."""
     while error is not None:
-        if isinstance(error, KeyboardInterrupt):
-            return True
+        yield error
         error = error.__cause__ or error.__context__
-    return False
+
+
+def is_interruption(error: BaseException) -> bool:
+    """Return whether an error is or follows from a `KeyboardInterrupt`, which compiled code can turn into any error."""
+    return any(isinstance(each, KeyboardInterrupt) for each in with_causes(error))
 
 
 def in_one_line(text: object) -> str:

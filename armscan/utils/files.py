@@ -16,6 +16,8 @@ from typing import BinaryIO
 
 import platformdirs
 
+from armscan.errors import with_causes
+
 UNFINISHED = "unfinished"
 # The disk is full, or the user's quota is.
 FULL_DISK = (errno.ENOSPC, errno.EDQUOT)
@@ -47,7 +49,7 @@ def atomic_write(
         follow_link: Whether to replace the target of a link at this path, and not the link. Default: False, because an
             untrusted folder may have links to any file of this user.
     """
-    path = _place(path, follow_link=follow_link)
+    path = path.resolve() if follow_link else path.parent.resolve() / path.name
     unfinished = _unfinished(path)
     try:
         with named_if_full(path):
@@ -82,10 +84,6 @@ def create_database(file: Path, make: Callable[[Path], object]) -> None:
             atomic_write(file, made.read_bytes(), follow_link=True)
 
 
-def _place(path: Path, *, follow_link: bool) -> Path:
-    return path.resolve() if follow_link else path.parent.resolve() / path.name
-
-
 @contextlib.contextmanager
 def named_if_full(path: Path) -> Iterator[None]:
     """Name the file in the error of a full disk, which itself names one only if opening a file raised it.
@@ -99,17 +97,11 @@ def named_if_full(path: Path) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        full = _full_disk(error)
+        errors = (each for each in with_causes(error) if isinstance(each, OSError))
+        full = next((each for each in errors if each.errno in FULL_DISK), None)
         if full is None or full.filename is not None:
             raise
         raise OSError(full.errno, full.strerror, str(path)) from error
-
-
-def _full_disk(error: BaseException | None) -> OSError | None:
-    """Return the error of a full disk: the error itself, or one that caused it; None if there is none."""
-    while error is not None and not (isinstance(error, OSError) and error.errno in FULL_DISK):
-        error = error.__cause__ or error.__context__
-    return error
 
 
 def nearest_existing(path: Path) -> Path:
