@@ -54,9 +54,11 @@ class AdamVectors:
                 vector[:] = 0.0
             else:
                 vector[:] = torch.cat([optimiser.state[each][key].reshape(-1) for each in self._parameters]).numpy()
-            views = _views(vector, self._parameters, is_scalar=key == "step")
-            for parameter, view in zip(self._parameters, views, strict=True):
-                optimiser.state[parameter][key] = view
+            tensor = torch.from_numpy(vector)
+            sizes = [each.numel() for each in self._parameters]
+            parts = tensor.unbind() if key == "step" else torch.split(tensor, sizes)
+            for parameter, part in zip(self._parameters, parts, strict=True):
+                optimiser.state[parameter][key] = part if key == "step" else part.view_as(parameter)
 
 
 def flattened(parameters: list[nn.Parameter]) -> Floats:
@@ -65,12 +67,3 @@ def flattened(parameters: list[nn.Parameter]) -> Floats:
     vector_to_parameters(vector, parameters)
     values: Floats = vector.numpy()
     return values
-
-
-def _views(vector: Floats, parameters: list[nn.Parameter], *, is_scalar: bool = False) -> list[torch.Tensor]:
-    """Return a view of a vector for each parameter, in its shape; with `is_scalar`, one number for each."""
-    tensor = torch.from_numpy(vector)
-    if is_scalar:
-        return list(tensor.unbind())
-    parts = torch.split(tensor, [each.numel() for each in parameters])
-    return [part.view_as(each) for part, each in zip(parts, parameters, strict=True)]
