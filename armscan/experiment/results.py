@@ -113,8 +113,8 @@ class RunResult:
 
     def markdown(self) -> str:
         """Return the table of agent and baselines on the test volumes, and the notes, in Markdown."""
-        shown = {name: each for name, each in self.figures.items() if name == TEST or name in self.baselines}
-        table = result_table({name: each for name, each in shown.items() if name != self.own_baseline})
+        shown = {TEST, *self.baselines} - {self.own_baseline}
+        table = result_table({name: each for name, each in self.figures.items() if name in shown})
         return "\n\n".join([table.markdown(), *self.notes()])
 
     def model_metrics(self) -> dict[str, list[str]]:

@@ -96,13 +96,12 @@ def _read(run: FoundRun, run_id: str, file: str, folder: Path) -> EvaluationRepo
     """Return the evaluation in an artifact, of the run itself or of one by `armscan evaluate`."""
     contents = _json(run, run_id, file, folder)
     try:
-        facts = {}
-        if run_id != run.run_id:
-            facts = {"data": contents["data"], "changes": contents["changes"], "notes": contents.get("notes", [])}
         if run_id == run.run_id:
+            facts = {}
             evaluations = {label: Evaluation.of_dict(each) for label, each in contents.items()}
             baselines = _own_baselines(run, folder)
         else:
+            facts = {"data": contents["data"], "changes": contents["changes"], "notes": contents.get("notes", [])}
             limits = contents.get("on_plane", ON_PLANE)
             evaluations = _evaluations(contents["episodes"], limits)
             kept = contents.get("baselines", {})
