@@ -45,7 +45,7 @@ def check_float(
         for word, bound in (("above", above), ("at least", at_least), ("at most", at_most))
         if math.isfinite(bound)
     ]
-    if not _is_finite(value) or value <= above or value < at_least or value > at_most:
+    if not is_finite(value) or value <= above or value < at_least or value > at_most:
         raise InvalidValueError(f"{name} is {value!r}, but it must be a finite number {' and '.join(bounds)}".rstrip())
     return float(value)
 
@@ -71,7 +71,7 @@ def check_numbers(name: str, value: Any, length: int, meaning: str) -> tuple[flo
         # The fast path of every environment step: the checks below cost more than the rest of its plane.
         return value
     is_sequence = isinstance(value, list | tuple) or (isinstance(value, np.ndarray) and value.ndim > 0)
-    if not is_sequence or len(value) != length or not all(map(_is_finite, value)):
+    if not is_sequence or len(value) != length or not all(map(is_finite, value)):
         raise InvalidValueError(f"{name} is {value!r}, but it must be {length} finite numbers, {meaning}")
     return tuple(float(number) for number in value)
 
@@ -103,7 +103,7 @@ def check_path(name: str, value: Any) -> Path:
     return Path(value)
 
 
-def _is_finite(value: Any) -> bool:
+def is_finite(value: Any) -> bool:
     """Return whether `value` is a number, not a truth value, that a float can hold."""
     try:
         return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)

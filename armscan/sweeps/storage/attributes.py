@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from numbers import Real
 from typing import Annotated, Any
@@ -15,7 +14,7 @@ from armscan.errors import ArmscanError, StudyError, few, reason_of
 from armscan.sweeps.storage.attribute_names import FINAL_SEED, FINALIST, METRICS, PARENT
 from armscan.sweeps.storage.reports import REPORT
 from armscan.utils.section import Section
-from armscan.utils.validation import MAX_SEED
+from armscan.utils.validation import MAX_SEED, is_finite
 
 # Suffixes to a study's name for the studies of its final trainings: those that select a configuration, and those that
 # judge it.
@@ -167,7 +166,7 @@ def unreadable(what: str, error: Exception) -> StudyError:
 def _wrong_numbers(trial: FrozenTrial, n_objectives: int) -> str | None:
     """Return what is wrong with a trial's values or reports; None if nothing is."""
     values: Sequence[Any] = trial.values or ()
-    if trial.state == TrialState.COMPLETE and (len(values) != n_objectives or not all(map(_is_finite, values))):
+    if trial.state == TrialState.COMPLETE and (len(values) != n_objectives or not all(map(is_finite, values))):
         return f"has the values {few(map(repr, values)) or 'None'}, but it must have {n_objectives} finite numbers"
     for step, value in trial.intermediate_values.items():
         if type(step) is not int or not isinstance(value, Real):
@@ -182,10 +181,6 @@ def _is_report(step: str, values: Any, n_objectives: int) -> bool:
     is_step = step.isascii() and step.isdigit() and len(step) <= MAX_STEP_DIGITS
     is_list = isinstance(values, list) and len(values) == n_objectives
     return is_step and is_list and all(type(value) in (int, float) for value in values)
-
-
-def _is_finite(value: Any) -> bool:
-    return isinstance(value, Real) and math.isfinite(value)
 
 
 def _check_final(trial: FrozenTrial, where: str, n_searched: int | None = None) -> None:
