@@ -244,9 +244,7 @@ def reset_each(
     return envs.reset(seed=seeds, options=options)  # type: ignore[arg-type]
 
 
-def step_each(
-    envs: VectorEnv[Any, Any, Any], actions: Any, env_ids: Sequence[int] | EnvIds | None = None
-) -> VectorStep:
+def step_each(envs: VectorEnv[Any, Any, Any], actions: Any, env_ids: Sequence[int] | EnvIds | None) -> VectorStep:
     """Take a step in a vector environment, or, if it is armscan's, in its `env_ids`; see `ArmscanVectorEnv.step`."""
     stepped: VectorStep = envs.step(actions) if env_ids is None else cast(Any, envs).step(actions, env_ids)
     return stepped

@@ -34,7 +34,7 @@ def evaluate_and_track(
     n_episodes: int,
     seed: int,
     changes: Mapping[str, Any],
-    out: Path | None = None,
+    out: Path | None,
 ) -> tuple[EvaluationReport, Path]:
     """Evaluate an agent, write the report as JSON, and track it.
 
@@ -44,7 +44,7 @@ def evaluate_and_track(
         n_episodes: Number of episodes for each group of volumes.
         seed: Seed of the evaluation, which the seeds of its episodes follow from.
         changes: Rules of the episodes that differ from the agent's configuration.
-        out: JSON file to write. Default: a new one in `evaluations`.
+        out: JSON file to write; None: a new one in `evaluations`.
 
     Returns:
         The report, and its JSON file.

@@ -17,14 +17,14 @@ FOLDER = Path("videos")
 SUFFIXES = (".gif", ".mp4")
 
 
-def record_video(prepared: PreparedAgent, *, n_episodes: int, seed: int, out: Path | None = None) -> list[Path]:
+def record_video(prepared: PreparedAgent, *, n_episodes: int, seed: int, out: Path | None) -> list[Path]:
     """Record the episodes that an evaluation with the same seed plays, and print how each went.
 
     Args:
         prepared: Agent on its volumes; of its own volumes, only the test volumes are shown.
         n_episodes: Number of episodes for each group of volumes.
         seed: Seed of the evaluation, which the seeds of its episodes follow from.
-        out: Folder of the files. Default: `videos`.
+        out: Folder of the files; None: `videos`.
 
     Returns:
         The GIF and the MP4.

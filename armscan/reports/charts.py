@@ -59,16 +59,14 @@ def colours(n: int) -> list[str]:
     return [str(palette[number % len(palette)]) for number in range(n)]
 
 
-def learning_curves(
-    groups: Sequence[Group], curves: Curves, titles: Mapping[str, str], *, is_detailed: bool = True
-) -> Figure:
+def learning_curves(groups: Sequence[Group], curves: Curves, titles: Mapping[str, str], *, is_detailed: bool) -> Figure:
     """Return metrics below each other, with switches for the axis and for the lines of single seeds.
 
     Args:
         groups: Groups that are drawn.
         curves: Their curves.
         titles: Title of each metric, by its name.
-        is_detailed: Whether bands and the lines of single seeds are drawn. Default: true.
+        is_detailed: Whether bands and the lines of single seeds are drawn.
     """
     entry_px = SAMPLE_PX + LETTER_PX * max(len(group.label) for group in groups)
     legend_px = LEGEND_ROW_PX * math.ceil(len(groups) / max(1, LEGEND_PX // entry_px))

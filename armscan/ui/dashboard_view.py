@@ -45,10 +45,10 @@ class DashboardView:
         stop: Function that asks the worker of a trial, by its ID in the storage, to end it; returns whether there is a
             worker. The button that fails a running trial calls it: the worker keeps its results, and the trial ends as
             pruned.
-        mlflow: Address of MLflow's UI for the links of trials. Default: None, the links stay as they are.
+        mlflow: Address of MLflow's UI for the links of trials; None: the links stay as they are.
     """
 
-    def __init__(self, application: WSGIApplication, stop: Callable[[int], bool], mlflow: str | None = None) -> None:
+    def __init__(self, application: WSGIApplication, stop: Callable[[int], bool], mlflow: str | None) -> None:
         self._application, self._stop, self._mlflow = application, stop, mlflow
 
     def __call__(self, environ: WSGIEnvironment, start_response: StartResponse) -> Iterable[bytes]:
