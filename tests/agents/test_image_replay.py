@@ -124,18 +124,17 @@ def test_no_frame_is_kept_twice_within_an_episode(phantom):
     assert len(replay._images["slice"].frames) <= 31
 
 
-def noise(rng, n_envs=2, shape=(2, 5, 7)):
-    """Return transitions whose frames are unrelated."""
+def noise(rng):
+    """Return transitions of two environments whose frames are unrelated."""
     obs, obs_next = (
-        Batch(noise=rng.integers(0, 256, (n_envs, *shape), dtype=np.uint8), number=rng.random((n_envs, 1)))
-        for _ in range(2)
+        Batch(noise=rng.integers(0, 256, (2, 2, 5, 7), dtype=np.uint8), number=rng.random((2, 1))) for _ in range(2)
     )
     return Batch(
         obs=obs,
-        act=rng.random((n_envs, 1)),
-        rew=rng.random(n_envs),
-        terminated=rng.random(n_envs) < 0.3,
-        truncated=np.zeros(n_envs, dtype=bool),
+        act=rng.random((2, 1)),
+        rew=rng.random(2),
+        terminated=rng.random(2) < 0.3,
+        truncated=np.zeros(2, dtype=bool),
         obs_next=obs_next,
     )
 

@@ -13,9 +13,9 @@ from tests.support.tensors import assert_same_tensors, named_tensors
 by_reinforcement = pytest.mark.parametrize("algorithm", ["sac", "ppo"], indirect=True)
 
 
-def begun(learner, env, seed=0):
-    observation, info = env.reset(seed=seed)
-    learner.begin(seed=seed, bounds=env.get_wrapper_attr("scene").bounds)
+def begun(learner, env):
+    observation, info = env.reset(seed=0)
+    learner.begin(seed=0, bounds=env.get_wrapper_attr("scene").bounds)
     return observation, float(info["reward"])
 
 

@@ -69,7 +69,7 @@ def all_that_is_drawn(learner):
     ]
 
 
-def assert_same_stats(ours, theirs, left_out=()):
+def assert_same_stats(ours, theirs, left_out):
     assert len(ours) == len(theirs)
     for one, other in zip(ours, theirs, strict=True):
         for field in fields(other):

@@ -13,14 +13,14 @@ def true_log(place):
     return 0.5 + 6.0 * (place[0] - 0.6) ** 2 + 0.3 * place[1] + 1.5 * (place[2] - 0.7) ** 2
 
 
-def synthetic_curves(n_configs, chance=0.1):
+def synthetic_curves(n_configs):
     """Return the curves of a table whose truth is known."""
     design, rng = Design.of("sac_y", n_configs), np.random.default_rng(0)
     config_of = np.repeat(np.arange(n_configs), N_SEEDS)
     worth = np.array([true_log(places_of(design.space, values)) for values in design.configs])[config_of]
     # Noise of a seed in all of its evaluations, and of each evaluation.
     logs = worth[:, None] + 3.0 * np.exp(-np.arange(N_EPOCHS + 2) / 2.0)
-    logs = logs + rng.normal(0.0, chance, (len(worth), 1)) + rng.normal(0.0, chance / 4, logs.shape)
+    logs = logs + rng.normal(0.0, 0.1, (len(worth), 1)) + rng.normal(0.0, 0.025, logs.shape)
     steps = np.exp(logs.clip(0.0, np.log(50.0)))
     return Curves(
         "sac_y",

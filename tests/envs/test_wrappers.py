@@ -123,11 +123,11 @@ def image_env(wrist, **wrappers):
     return make_armscan_env([wrist], observation=observation, projection="zy", max_steps=9, **wrappers)
 
 
-def steps(env, n_steps=4):
+def steps(env):
     """Yield what is observed from a reset on, and `info`."""
     env.action_space.seed(0)
     yield env.reset(seed=1)
-    for _ in range(n_steps):
+    for _ in range(4):
         observed, *_, info = env.step(env.action_space.sample())
         assert env.observation_space.contains(observed)
         yield observed, info

@@ -13,10 +13,10 @@ from armscan.tracking.outbox import file_of
 from armscan.utils.run_files import LOCK_FILE
 
 
-def ids_in(folder, stage="active"):
-    """Return the IDs of the runs of a database in a lifecycle stage: active or deleted."""
+def ids_in(folder):
+    """Return the IDs of the active runs of a database."""
     with sqlite3.connect(folder / "mlruns.db") as database:
-        found = database.execute("select run_uuid from runs where lifecycle_stage = ?", (stage,))
+        found = database.execute("select run_uuid from runs where lifecycle_stage = 'active'")
         return {run_id for (run_id,) in found}
 
 
@@ -71,7 +71,7 @@ def kept_files():
     return {file: file.read_bytes() for file in Path.cwd().rglob("*") if file.suffix in (".pt", ".yaml")}
 
 
-def assert_stays(answer, run_id, reason, what="folders"):
+def assert_stays(answer, run_id, reason, what):
     """Check that a run is left with a reason, in the dry run and with --apply, and that this is no failure."""
     planned = answer("prune", what)[1]
     kept = kept_files()

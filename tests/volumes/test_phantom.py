@@ -34,9 +34,9 @@ def ends_of_rows(draw, seed):
     return max(high for low, high in spans if low < 0 < high), min(low for low, _ in spans if low > 0)
 
 
-def rewards_along_the_arm(volume, step_mm=1.0):
+def rewards_along_the_arm(volume):
     rotation, (tx, _) = volume.optimal_action.rotation, volume.optimal_action.translation
-    positions = np.arange(0.0, volume.size_mm[1], step_mm)
+    positions = np.arange(0.0, volume.size_mm[1])
     planes = (ManipulatorAction(rotation, (tx, ty)) for ty in positions)
     return positions, np.array([landmark_reward(TissueClusters.from_slice(volume.slice(p))) for p in planes])
 

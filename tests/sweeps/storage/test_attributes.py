@@ -49,12 +49,11 @@ def is_refused(check):
     return line != ""
 
 
-def study_with(trial_attributes=(), study_attributes=(), state=TrialState.RUNNING):
+def study_with(trial_attributes, state=TrialState.RUNNING):
     storage = optuna.storages.InMemoryStorage()
     study = optuna.create_study(study_name="a", storage=storage)
-    for name, value in ({OBJECTIVES: {"mean_steps": "minimize"}} | dict(study_attributes)).items():
-        study.set_user_attr(name, value)
-    study.add_trial(create_trial(state=state, value=None, user_attrs=dict(trial_attributes)))
+    study.set_user_attr(OBJECTIVES, {"mean_steps": "minimize"})
+    study.add_trial(create_trial(state=state, value=None, user_attrs=trial_attributes))
     return study
 
 
