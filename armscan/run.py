@@ -27,7 +27,7 @@ from armscan.config.defaults import MULTIRUN, PLAN, RESUME
 from armscan.config.error_messages import TRACEBACKS, print_mistake
 from armscan.config.sources import SWEEP
 from armscan.errors import is_interruption
-from armscan.experiment.job import INTERRUPTED, Invocation, check_folder_stays, remove_if_untracked
+from armscan.experiment.job import INTERRUPTED, Invocation, check_choices, check_folder_stays, remove_if_untracked
 from armscan.launch.folds_grid import with_folds
 from armscan.launch.grid_plan import check_grid, print_grid_plan
 from armscan.launch.job_process import start_job
@@ -118,6 +118,7 @@ def main() -> int:
     try:
         check_words(sys.argv[1:])
         check_folder_stays(sys.argv[1:])
+        check_choices(sys.argv[1:])
         if any(word.startswith(f"{SWEEP}=") for word in sys.argv[1:]):
             if PLAN not in sys.argv[1:]:
                 print("preparing a study: its space is checked first", flush=True)

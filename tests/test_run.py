@@ -261,10 +261,7 @@ def test_run_on_labelmap_files(tmp_path, data_folder):
         (["seed"], "'seed' cannot be read: what follows the options must be key=value"),
         (["foo"], "'foo' cannot be read"),
         (["obs=null"], "Config group override must be a string or a list. Got NoneType"),
-        (
-            ["obs=[cluster,slice]"],
-            "Error in call to target 'armscan.envs.slice_observations.SliceObservation': Type",
-        ),
+        (["obs=[cluster,slice]"], "'obs=[cluster,slice]' is not allowed: a run has one obs, obs=NAME"),
         (["+foo=1"], "there is no key 'foo' at the top, but only data, obs, "),
         (["+evaluation.seed=4"], "there is no key 'seed' in evaluation, but only episodes"),
         (["network.images=null"], "network.images is None, but it must have the methods of Network"),
@@ -275,7 +272,10 @@ def test_run_on_labelmap_files(tmp_path, data_folder):
             ["agent=exhaustive_grid", "projection=zy", "agent.step_mm=0.01", "agent.step_deg=0.01"],
             "agent.step_mm is 0.01 and agent.step_deg is 0.01, which give ",
         ),
-        (["obs=cluster,action_reward"], "'obs=cluster,action_reward' gives several values: add -m"),
+        (["obs=cluster,action_reward"], "'obs=cluster,action_reward' gives several values: armscan run -m"),
+        (["agent=[sac,ppo]"], "'agent=[sac,ppo]' is not allowed: a run has one agent, agent=NAME"),
+        (["~data"], "'~data' is not allowed: a run has one data, data=NAME"),
+        (["-m", "obs=[cluster],slice", "--plan"], "'obs=[cluster],slice' is not allowed: a run has one obs"),
         (
             ["data.path=wrists"],
             "there is no key 'path' in data, but only n_training, n_validation, n_test, first_seed, cache_dir or "

@@ -123,12 +123,14 @@ def evaluate(
     from armscan import evaluation
     from armscan.config.defaults import default_tracking
     from armscan.evaluation.runner import prepare_agent
+    from armscan.experiment.job import check_choices
 
     if agent is None:
         source = evaluation.agent_of_run(tracking, run[0], changes, trust=trust)
     else:
         import_from_here()
         overrides = [f"agent={agent}", *run, *(["data=nifti"] if folder else [])]
+        check_choices(overrides)
         source = evaluation.agent_of_overrides(overrides, folder, changes)
     n_episodes = episodes or (N_VIDEO_EPISODES if video else N_EPISODES)
     if video:

@@ -24,6 +24,8 @@ RESUME, TRACKING_URI = "resume", "tracking.uri"
 PLAN = "--plan"
 # The section with services that many machines share.
 CLUSTER = "cluster"
+# Configuration groups from which every run makes one choice, as its tags tell.
+CHOICES = ("data", "obs", "reward", "agent", "network")
 # Hydra's options for several runs.
 MULTIRUN = ("-m", "--multirun")
 # Keys that may differ between runs of the same experiment: how it is computed, tracked and reported, and the seed.

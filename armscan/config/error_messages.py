@@ -48,7 +48,7 @@ def one_line_message(error: BaseException) -> str | None:
         case ConfigCompositionException(__cause__=ConfigAttributeError() | ConfigKeyError() as unknown):
             return _unknown_key(unknown)
         case HydraException() if several := re.match("Ambiguous value for argument '(.*?)' 1", text):
-            return f"{several[1]!r} gives several values: add -m to try each of them, or write a list as KEY=[A,B]"
+            return f"{several[1]!r} gives several values: armscan run -m tries each of them; a list is KEY=[A,B]"
         case OverrideParseException():
             if given := re.fullmatch(r"([+~]*[\w./@:-]+)=(.*)", str(error.override), re.DOTALL):
                 return (

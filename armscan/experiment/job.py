@@ -18,6 +18,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 
 from armscan.config.command_hints import kept_command
+from armscan.config.defaults import CHOICES
 from armscan.errors import FolderInUseError, FolderTakenError, InvalidValueError
 from armscan.utils.files import atomic_write, sha256
 from armscan.utils.run_files import CONFIG_FILE, LOCK_FILE, OUTBOX_FOLDER, OUTBOX_SUFFIXES, RUN_ID
@@ -138,6 +139,17 @@ def check_folder_stays(words: Sequence[str]) -> None:
         if key == "hydra.job.chdir" and value.lower() != "false":
             raise InvalidValueError(
                 f"{key} is {value!r}, but it must be false: relative paths, the store's too, begin where it was started"
+            )
+
+
+def check_choices(words: Sequence[str]) -> None:
+    """Raise `InvalidValueError` if a command line removes a configuration group or gives it a list, as Hydra allows."""
+    for word in words:
+        key, _, value = word.partition("=")
+        group = key.lstrip("+~")
+        if group in CHOICES and (key.startswith("~") or "[" in value):
+            raise InvalidValueError(
+                f"{word!r} is not allowed: a run has one {group}, {group}=NAME (armscan run --help lists the names)"
             )
 
 

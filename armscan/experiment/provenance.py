@@ -13,7 +13,7 @@ import yaml
 from omegaconf import DictConfig
 
 import armscan
-from armscan.config.defaults import to_plain
+from armscan.config.defaults import CHOICES, to_plain
 from armscan.experiment.build import Experiment
 from armscan.experiment.job import Invocation
 from armscan.tracking import (
@@ -40,7 +40,6 @@ from armscan.utils.run_files import (
     VOLUMES_FILE,
 )
 
-CHOICES_IN_TAGS = ("data", "obs", "reward", "agent", "network")
 # Length of a volume's fingerprint in a tag; `volumes.json` has the whole.
 N_PRINT_CHARS = 16
 
@@ -83,7 +82,7 @@ def start_tracking(
             "command": invocation.command,
             "seed": str(resolved["seed"]),
             "overrides": " ".join(invocation.overrides),
-            **{f"{CHOICE}{group}": choices[group] for group in CHOICES_IN_TAGS},
+            **{f"{CHOICE}{group}": choices[group] for group in CHOICES},
             **volume_tags(setup),
             # On other volumes, an evaluation must reproduce the agent's observations.
             DOMAIN_TAG: TrainingDomain.of(setup.training_env, setup.smallest_slice_px).to_json(),

@@ -12,11 +12,12 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from armscan.config.command_hints import armscan_command
+from armscan.config.defaults import CHOICES
 from armscan.errors import InvalidValueError, TrackingError
 from armscan.evaluation.agent_source import from_its_folder
 from armscan.experiment.build import Experiment, set_up
 from armscan.experiment.job import Invocation, remove_if_untracked
-from armscan.experiment.provenance import CHOICES_IN_TAGS, start_tracking
+from armscan.experiment.provenance import start_tracking
 from armscan.experiment.runner import run_tracked
 from armscan.runs.compare import Comparison, compare_runs
 from armscan.tracking import FoundRun, code_state, environment_tags, load_agent_run
@@ -132,7 +133,7 @@ def reproduce(original: Original, folder: Path, differing: Sequence[str]) -> Com
         raise InvalidValueError(f"--out is {str(folder)!r}, but it exists and is not an empty folder: name another")
     is_ours = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
-    choices = {group: run.tags.get(f"{CHOICE}{group}", "unknown") for group in CHOICES_IN_TAGS}
+    choices = {group: run.tags.get(f"{CHOICE}{group}", "unknown") for group in CHOICES}
     overrides = run.tags.get("overrides", "").split()
     uri = original.config.tracking.uri
     command = armscan_command("runs", "reproduce", run.run_id, tracking=uri, trust=original.setup.needs_trust)

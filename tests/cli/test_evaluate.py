@@ -41,6 +41,8 @@ def test_evaluate_answers_mistakes_in_one_line(evaluate, tmp_path, data_folder):
             "Error in call to target 'armscan.agents.baselines.Random': TypeError(",
         ),
         ([run_id, "--tracking-experiment=x"], "--tracking-experiment is for --agent without --video"),
+        (["--agent=[random]"], "'agent=[random]' is not allowed: a run has one agent, agent=NAME"),
+        (["--agent=random,exhaustive"], "'agent=random,exhaustive' gives several values"),
         (["--agent=random", "experiment=x"], "experiment is 'x', but it must be best_full, "),
         (
             ["--agent=random", "tracking.experiment=x"],
