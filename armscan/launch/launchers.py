@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import shutil
 from importlib.util import find_spec
 
@@ -10,6 +11,8 @@ from armscan.errors import InvalidValueError
 
 LAUNCHER = "hydra/launcher"
 ON_THIS_MACHINE = ("basic", "joblib", "submitit_local")
+# Prefixes of the environment variables of a Slurm job.
+OF_A_JOB = ("SLURM_", "SUBMITIT_")
 SLURM, RAY = "submitit_slurm", "ray"
 # By launcher: the extra of armscan that installs its packages, and their names.
 IMPORTED = {
@@ -32,10 +35,14 @@ def check_launcher(name: str) -> None:
         )
 
 
-def silence_launcher(name: str) -> None:
-    """Keep a launcher's messages about waiting off the screen."""
+def prepare_launcher(name: str) -> None:
+    """Keep a launcher's messages about waiting off the screen, and the Slurm job of this process out of its jobs."""
     if name == SLURM:
         # Without Slurm accounting, submitit warns again and again. Its import sets the level, so it comes first.
         import submitit
 
         logging.getLogger(submitit.__name__).setLevel(logging.ERROR)
+        if "SLURM_JOB_ID" in os.environ:
+            # sbatch passes them on: a single job would take its ID from the array that this process's job belongs to.
+            for variable in [each for each in os.environ if each.startswith(OF_A_JOB) and each != "SLURM_CONF"]:
+                del os.environ[variable]

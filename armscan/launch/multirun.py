@@ -32,7 +32,7 @@ from armscan.experiment.job import (
     JobOutcome,
     remove_run_folder,
 )
-from armscan.launch.launchers import LAUNCHER, check_launcher
+from armscan.launch.launchers import LAUNCHER, check_launcher, prepare_launcher
 from armscan.tracking.tags import FAILURE_TAG, FOLDER_TAG, GRID_TAG, JOB_TAG
 from armscan.utils.files import atomic_write
 from armscan.utils.run_files import LAST_CHECKPOINT, RESULTS_PAGE
@@ -80,7 +80,9 @@ class Multirun(Callback):
         if config.get("study") is not None:
             # A study has its own run, which continues when workers are started again.
             return
-        check_launcher(config.hydra.runtime.choices[LAUNCHER])
+        launcher = config.hydra.runtime.choices[LAUNCHER]
+        check_launcher(launcher)
+        prepare_launcher(launcher)
         folder = Path(config.hydra.sweep.dir)
         print(f"preparing a grid in {folder}", flush=True)
         # Deferred: it loads MLflow, after the first line is printed.

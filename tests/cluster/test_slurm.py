@@ -96,6 +96,14 @@ def test_a_cancelled_job_ends_its_worker_alone_and_an_interrupt_ends_all(cluster
     assert {run.info.status for run in study.runs()} <= {"FINISHED", "KILLED"}
 
 
+def test_study_that_is_started_in_a_job_of_an_array_has_a_job_of_its_own(cluster, start):
+    enclosing = {"SLURM_JOB_ID": "76", "SLURM_JOBID": "76", "SLURM_ARRAY_JOB_ID": "76", "SLURM_ARRAY_TASK_ID": "9"}
+    words = ["study.workers=1", "study.n_trials=1", "study.final_eval.top_k=0"]
+    study = start(*WAITING, *SLURM[:-1], *words, environment=cluster.environment | enclosing)
+    assert study.end() == 0, study.told()
+    study.check_complete(1)
+
+
 def test_study_that_slurm_does_not_take_says_why_in_one_line(cluster, start):
     study = start(*WAITING, *SLURM, "hydra.launcher.partition=nowhere", environment=cluster.environment)
     assert study.end() == 2

@@ -1,5 +1,6 @@
 """Hydra's launchers for a cluster: their settings, and the error where they cannot be used."""
 
+import os
 import sys
 import warnings
 
@@ -8,7 +9,7 @@ from omegaconf import OmegaConf
 
 from armscan.config.compose import compose
 from armscan.errors import InvalidValueError
-from armscan.launch.launchers import check_launcher
+from armscan.launch.launchers import check_launcher, prepare_launcher
 from armscan.utils.log import silence_libraries
 from tests.support import FEW_VOLUMES
 
@@ -33,6 +34,16 @@ def test_slurm_is_looked_for_where_the_command_is_typed(monkeypatch, tmp_path):
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(InvalidValueError, match="hydra/launcher is 'submitit_slurm', but this machine has no sbatch"):
         check_launcher("submitit_slurm")
+
+
+def test_jobs_of_slurm_do_not_inherit_the_job_that_they_are_started_in(monkeypatch):
+    for variable in ("SLURM_JOB_ID", "SLURM_ARRAY_TASK_ID", "SUBMITIT_EXECUTOR", "SLURM_CONF", "SBATCH_PARTITION"):
+        monkeypatch.setenv(variable, "9")
+    prepare_launcher("basic")
+    assert os.environ["SLURM_ARRAY_TASK_ID"] == "9"
+    prepare_launcher("submitit_slurm")
+    left = [each for each in os.environ if each.startswith(("SLURM_", "SUBMITIT_", "SBATCH_"))]
+    assert sorted(left) == ["SBATCH_PARTITION", "SLURM_CONF"]
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from armscan.config.defaults import TRACKING_URI
 from armscan.config.error_messages import one_line_message
 from armscan.config.sources import working_folder
 from armscan.errors import ArmscanError, StudyError, reason_of
-from armscan.launch.launchers import LAUNCHER, ON_THIS_MACHINE, silence_launcher
+from armscan.launch.launchers import LAUNCHER, ON_THIS_MACHINE, prepare_launcher
 from armscan.sweeps.results.judgement import best_metrics, judge, result_note
 from armscan.sweeps.results.progress import progress_display
 from armscan.sweeps.space.parameter import hydra_literal
@@ -102,7 +102,7 @@ def _arguments(opened: OpenedStudy, given: StudyCommand, launcher: str, folder: 
 
 def _launch_elsewhere(monitor: StudyMonitor, folder: Path, launcher: str, launch: Callable[[], object]) -> None:
     """Launch workers on other machines, and wait for the end of the study, even if the launcher fails."""
-    silence_launcher(launcher)
+    prepare_launcher(launcher)
     try:
         with monitor.interrupting():
             launch()
