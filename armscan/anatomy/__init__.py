@@ -22,6 +22,7 @@ from armscan.anatomy.tissues import (
     Tissue,
     Tissues,
     check_tissues,
+    is_coarse,
 )
 
 __all__ = [
@@ -47,6 +48,7 @@ __all__ = [
     "check_targets",
     "check_tissues",
     "find_optimal_plane",
+    "is_coarse",
     "landmark_reward",
     "nerve_area_error",
     "tissue_dice",

@@ -12,6 +12,9 @@ from armscan.errors import InvalidValueError
 from armscan.utils.validation import check_float, check_int, check_numbers
 
 USUAL_PIXEL_MM = (0.27, 0.55)
+# From this multiple of the usual size on, clusters of pixels merge, and more planes score best. At 1.8 times, searches
+# end up to 2.5 mm or 4 degrees away; at 3 to 4 times, up to 10 mm or 22 degrees (three wrists each).
+COARSE = 1.5
 N_TISSUES = 3
 # A pixel at exactly eps is a neighbour, even if the spacing was stored as a 32-bit float.
 ROUNDING = 1.0 + 1e-6
@@ -126,6 +129,11 @@ METRIC_TISSUES = Tissues(
     MetricTissue(label=3, eps_mm=MAX_METRIC_PIXEL_MM, density=0.8),
 )
 CLUSTERINGS: dict[str, Tissues] = {"pixels": PIXEL_TISSUES, "metric": METRIC_TISSUES}
+
+
+def is_coarse(pixel_mm: tuple[float, float]) -> bool:
+    """Return whether pixels (across, depth), in mm, are too large for `PIXEL_TISSUES`."""
+    return any(mm > COARSE * usual for mm, usual in zip(pixel_mm, USUAL_PIXEL_MM, strict=True))
 
 
 def check_tissues(clustering: str | Tissues) -> Tissues:

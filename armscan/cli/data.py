@@ -19,7 +19,7 @@ from armscan.cli.options import (
     tracking_option,
     trust_option,
 )
-from armscan.errors import InvalidValueError, few, print_error
+from armscan.errors import InvalidValueError, few, listed, print_error
 from armscan.utils.console import WHOLE_CHARS, print_sentence, print_table, wide_console
 from armscan.utils.text import counted
 
@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 # Folder of pictures within the folder of the data.
 PICTURES = "labelling"
+# Tissues that a labelled plane shows.
+LANDMARKS = ("bones", "tendons", "artery")
 # Names of files that are listed.
 N_LISTED = 8
 
@@ -172,7 +174,7 @@ def _print_dataset(dataset: Dataset, folder: Path) -> None:
         console.print(Text(f"{name}: subject {dataset.subjects[name]}, {split}{plane}", style="bold"))
         console.print(Text(_geometry(report)))
         console.print(_tissue_table(report))
-        for note in report.notes:
+        for note in (*report.notes, *_coarse_note(report.volume)):
             console.print(Text(f"note: {note}"))
     read = {*dataset.reports, *dataset.excluded, *MANIFEST_NAMES, PICTURES}
     if others := sorted(each.name for each in folder.iterdir() if each.name not in read and each.name[0] != "."):
@@ -194,10 +196,28 @@ def _print_dataset(dataset: Dataset, folder: Path) -> None:
 
 def _plane_of(volume: LabelVolume) -> str:
     from armscan.envs.scene import reachable_optimum
+    from armscan.volumes.labelmap import TISSUE_LABELS
 
     if volume.optimal_action is None:
         return "no labelled plane"
-    return "a labelled plane" if reachable_optimum(volume) else "a labelled plane that misses the volume"
+    if (plane := reachable_optimum(volume)) is None:
+        return "a labelled plane that misses the volume"
+    labels = volume.slice(plane)
+    missing = [tissue for tissue in LANDMARKS if TISSUE_LABELS[tissue] not in labels]
+    return "a labelled plane" + (f" that shows no {listed(missing)}" if missing else "")
+
+
+def _coarse_note(volume: LabelVolume) -> list[str]:
+    """Return a note if pixels are too large to be clustered by pixels, as is the default."""
+    from armscan.anatomy import USUAL_PIXEL_MM, is_coarse
+
+    if not is_coarse(volume.pixel_mm):
+        return []
+    (usual_across, usual_depth), (across, depth) = USUAL_PIXEL_MM, volume.pixel_mm
+    return [
+        f"pixels of {across:.2g} x {depth:.2g} mm are coarse: clusters merge, so planes that look alike differ by many "
+        f"degrees; spacing: [{usual_across}, {usual_across}, {usual_depth}] in the manifest resamples the volumes"
+    ]
 
 
 def _tissue_table(report: VolumeReport) -> Table:
@@ -236,7 +256,7 @@ def _grid(shape: Sequence[int], spacing: Sequence[float]) -> str:
 
 def _print_planes(options: LabellingOptions, labelled: Sequence[tuple[LabelVolume, FoundPlane]]) -> None:
     """Print a table of the planes, and the next steps to check them."""
-    from armscan.anatomy import SUCCESS_THRESHOLD
+    from armscan.anatomy import PIXEL_TISSUES, SUCCESS_THRESHOLD
     from armscan.config.command_hints import armscan_command
     from armscan.volumes.markups import MARKUP_SUFFIX
 
@@ -257,6 +277,8 @@ def _print_planes(options: LabellingOptions, labelled: Sequence[tuple[LabelVolum
     names = [volume.name for volume, _ in labelled]
     print_table("volume", names, [Column(heading, justify="right") for heading in headings], rows)
     for volume, plane in labelled:
+        for note in _coarse_note(volume) if options.tissues is PIXEL_TISSUES else ():
+            print_sentence(f"note: {volume.name}: {note}")
         if (before := volume.optimal_action) is not None:
             rz, rx, tx, ty = before.to_array()
             print_sentence(

@@ -181,7 +181,8 @@ def _env(env_factory: EnvFactory, volumes: VolumesByName, clustering: object, re
         usual, *shown = (f"{across:.3g} x {depth:.3g}" for across, depth in (USUAL_PIXEL_MM, *sorted(sizes)))
         raise InvalidValueError(
             f"{error}; clusters are found by pixels, as suits about {usual} mm, and here a pixel has {listed(shown)} "
-            "mm" + (": unless the plane is wrong, --clustering metric may see them" if can_be_metric else "")
+            "mm: unless the plane is wrong, "
+            + ("--clustering metric may see them" if can_be_metric else "volumes that the manifest resamples show them")
         ) from error
 
 

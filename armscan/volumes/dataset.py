@@ -97,8 +97,8 @@ def open_dataset(path: str | Path, *, require_manifest: bool = True) -> Dataset:
         (_, first), *others = errors.items()
         more = f"; these cannot be read either: {few(name for name, _ in others)}" if others else ""
         raise VolumeError(f"{first}{more}") from first
-    if manifest.spacing == "finest":
-        spacing = finest_spacing(volumes.values())
+    if manifest.spacing != "own":
+        spacing = finest_spacing(volumes.values()) if isinstance(manifest.spacing, str) else manifest.spacing
         volumes = {name: resample_cached(volume, spacing) for name, volume in volumes.items()}
     volumes = {name: volume.of_subject(used[name].subject) for name, volume in volumes.items()}
     subjects = {name: entry.subject or name for name, entry in entries.items()}

@@ -15,6 +15,10 @@ from armscan.utils.validation import check_float, check_numbers
 from armscan.volumes.labelmap import LabelMap
 from armscan.volumes.orientation import Crop, check_axes, check_crop, check_orientation
 from armscan.volumes.plane import ManipulatorAction
+from armscan.volumes.resampling import Spacing
+
+# Of each volume, or the finest of all along each axis.
+SPACINGS = ("own", "finest")
 
 
 def _printable(text: str) -> str:
@@ -33,6 +37,17 @@ def _subjects(value: Any) -> tuple[str, ...]:
     if not isinstance(value, list | tuple) or not value or not all(isinstance(name, str) and name for name in value):
         raise InvalidValueError(f"a split is {value!r}, but it must be a list of at least one subject (strings)")
     return tuple(value)
+
+
+def _spacing(value: Any) -> str | Spacing:
+    if isinstance(value, str):
+        if value in SPACINGS:
+            return value
+        raise InvalidValueError(f"spacing is {value!r}, but it must be {listed([*SPACINGS, '(sx, sy, sz) in mm'])}")
+    s_x, s_y, s_z = check_numbers("spacing", value, 3, "(sx, sy, sz) in mm")
+    if min(s_x, s_y, s_z) <= 0:
+        raise InvalidValueError(f"spacing is {[s_x, s_y, s_z]}, but each must be above 0")
+    return s_x, s_y, s_z
 
 
 Rotation = Annotated[
@@ -113,7 +128,7 @@ class Splits(_Strict):
 class Manifest(_Settings):
     """A whole manifest; keys at the top are the defaults of every volume's entry."""
 
-    spacing: Literal["own", "finest"] = Field(default="own", description="own or finest")
+    spacing: Annotated[str | Spacing, BeforeValidator(_spacing)] = "own"
     splits: Splits | None = Field(default=None, description="lists of subjects under train, validation and test")
     volumes: dict[Text, VolumeEntry] | None = Field(default=None, description="entries by the names of the files")
 

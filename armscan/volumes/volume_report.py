@@ -20,6 +20,9 @@ from armscan.volumes.labelmap import (
 from armscan.volumes.orientation import Crop, orientation_of
 from armscan.volumes.volume import LabelVolume
 
+# Limits of the longest side of a volume of an arm.
+SMALLEST_MM, LARGEST_MM = 20.0, 2000.0
+
 
 @dataclass(frozen=True, kw_only=True)
 class StoredFile:
@@ -62,8 +65,11 @@ class VolumeReport:
 
     @property
     def notes(self) -> list[str]:
-        """Notes on axes that may differ from those of phantoms, one sentence each."""
+        """Notes on a size that no arm has, and on axes that may differ from those of phantoms, one sentence each."""
         notes, size_mm = [], self.volume.size_mm
+        if not SMALLEST_MM <= max(size_mm) <= LARGEST_MM:
+            sizes = " x ".join(f"{mm:.2g}" for mm in size_mm)
+            notes.append(f"the volume is {sizes} mm large: is the spacing in its file in mm?")
         if size_mm[1] < max(size_mm):
             sizes = " x ".join(f"{mm:.0f}" for mm in size_mm)
             notes.append(f"y, along the arm, is not the longest of {sizes} mm; axes in the manifest orders them")

@@ -6,6 +6,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+import SimpleITK
 from PIL import Image
 
 import armscan.annotation.labelling
@@ -95,6 +96,17 @@ def test_label_leaves_planes_that_are_there_unless_told_otherwise(bare, names, q
     assert "every volume has a plane already" in capsys.readouterr().out
     assert main(["data", "label", str(bare), f"--volumes={names[0]}", "--overwrite"]) == 0
     assert planes(bare)[names[0]] == first
+
+
+@pytest.mark.parametrize(("clustering", "is_noted"), [("pixels", True), ("metric", False)])
+def test_label_notes_voxels_that_are_too_coarse_for_clusters_of_pixels(bare, names, capsys, clustering, is_noted):
+    image = SimpleITK.ReadImage(bare / names[0])
+    image.SetSpacing((0.5, 0.5, 0.55))
+    SimpleITK.WriteImage(image, bare / names[0])
+    write_markup(bare / "moved.mrk.json", read_volume(bare / names[0]), ManipulatorAction((0.0, 0.0), (0.0, 20.0)))
+    words = [f"--markup={bare}/moved.mrk.json", f"--volume={names[0]}", f"--clustering={clustering}"]
+    assert main(["data", "label", str(bare), *words]) == 0
+    assert (f"note: {names[0]}: pixels of 0.5 x 0.55 mm are coarse" in capsys.readouterr().out) == is_noted
 
 
 def test_label_takes_a_plane_that_was_moved_in_slicer(bare, names, capsys):

@@ -2,6 +2,8 @@
 
 import shutil
 
+import numpy as np
+
 from armscan.cli.main import main
 
 
@@ -52,6 +54,32 @@ def test_data_command_notes_a_palm_at_low_z_and_a_plane_that_misses_the_volume(
     manifest.write_text("orientation: LPS\n")
     assert main(["data", "inspect", str(tmp_path)]) == 0
     assert "note:" not in capsys.readouterr().out
+
+
+def test_data_command_notes_coarse_voxels_a_size_that_no_arm_has_and_a_plane_without_landmarks(
+    write_labelmap, tmp_path, monkeypatch, capsys
+):
+    # Set in the workers of pytest-xdist.
+    monkeypatch.delenv("COLUMNS", raising=False)
+    labels = np.zeros((20, 30, 10), int)
+    labels[5:10, 10:20, 2], labels[5:10, 10:20, 5], labels[5:10, 10:12, 8] = 1, 2, 3
+    manifest = tmp_path / "manifest.yaml"
+    manifest.write_text("volumes: {a.nrrd: {rotation: [0, 0], translation: [0, 15]}}")
+    write_labelmap("a.nrrd", labels, (1.0, 1.0, 1.0))
+    assert main(["data", "inspect", str(tmp_path)]) == 0
+    printed = capsys.readouterr().out
+    assert "a.nrrd: subject a.nrrd, a labelled plane that shows no artery\n" in printed
+    assert "note: pixels of 1 x 1 mm are coarse" in printed
+    assert "mm large" not in printed
+    manifest.write_text("spacing: [0.27, 0.27, 0.55]\nvolumes: {a.nrrd: {rotation: [0, 0], translation: [0, 10]}}")
+    assert main(["data", "inspect", str(tmp_path)]) == 0
+    printed = capsys.readouterr().out
+    assert "a.nrrd: subject a.nrrd, a labelled plane\n" in printed
+    assert "note:" not in printed
+    write_labelmap("a.nrrd", labels, (0.001, 0.001, 0.001))
+    manifest.write_text("{}")
+    assert main(["data", "inspect", str(tmp_path)]) == 0
+    assert "note: the volume is 0.02 x 0.03 x 0.01 mm large: is the spacing" in capsys.readouterr().out
 
 
 def test_data_command_needs_no_manifest_and_lists_what_it_does_not_read(write_labelmap, tmp_path, capsys):

@@ -58,8 +58,10 @@ def test_resampled_refuses_what_no_machine_holds():
         resample(random_volume((8, 8, 8), (1.0, 1.0, 1.0)), (1e-6, 1e-6, 1e-6))
 
 
-@pytest.mark.parametrize(("spacing", "expected"), [("own", False), ("finest", True)])
-def test_manifest_brings_volumes_to_the_finest_spacing(write_labelmap, tmp_path, spacing, expected):
+@pytest.mark.parametrize(
+    ("spacing", "expected"), [("own", False), ("finest", True), ("[0.3, 0.4, 0.5]", True), ("[0.2, 0.4, 0.5]", False)]
+)
+def test_manifest_brings_volumes_to_one_spacing(write_labelmap, tmp_path, spacing, expected):
     write_labelmap("a.nrrd", spacing=(0.3, 0.5, 0.5, 1.0))
     write_labelmap("b.nrrd", spacing=(0.4, 0.4, 0.6, 1.0))
     (tmp_path / "manifest.yaml").write_text(f"spacing: {spacing}")
