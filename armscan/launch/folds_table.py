@@ -3,22 +3,14 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from armscan.config.defaults import FOLD
-from armscan.reports.html import page
 from armscan.training import TEST, Evaluation, MetricEstimates, ResultTable
 from armscan.training.baselines import RANDOM
-from armscan.training.episode_results import TEST_METRICS, metric_prefix
-from armscan.training.headline import ABOVE_RANDOM, beside_random, headline
-from armscan.utils.files import atomic_write
-from armscan.utils.run_files import BASELINES_FILE, EVALUATION_FILE, RESULTS_PAGE
-
-if TYPE_CHECKING:
-    from armscan.tracking import TrackingStore
+from armscan.training.headline import beside_random, headline
+from armscan.utils.run_files import BASELINES_FILE, EVALUATION_FILE
 
 SEED = "seed"
 ALL_FOLDS = ", all folds"
@@ -80,46 +72,3 @@ def _evaluations(folder: Path) -> dict[str, Evaluation]:
     agent = Evaluation.of_dict(json.loads((folder / EVALUATION_FILE).read_text())[TEST])
     baselines = json.loads((folder / BASELINES_FILE).read_text())
     return {AGENT: agent, **{f"{name}{ALL_FOLDS}": Evaluation.of_dict(each) for name, each in baselines.items()}}
-
-
-def keep_table(
-    table: ResultTable, jobs: ResultTable, folder: Path, store: TrackingStore, run_id: str, notes: Sequence[str]
-) -> None:
-    """Save the tables of all folds and of the jobs in the grid's folder, and with the figures in the grid's run.
-
-    Args:
-        table: Table of all folds.
-        jobs: Table of the jobs, shown below.
-        folder: Folder of the grid.
-        store: Store of the grid's run.
-        run_id: MLflow run ID of the grid.
-        notes: Notes on the table, such as missing folds.
-
-    Raises:
-        TrackingError: If the store is unavailable.
-    """
-    from mlflow.entities import Metric
-
-    from armscan.tracking.outbox import now_ms
-    from armscan.tracking.uploader import set_description
-
-    file = folder / RESULTS_PAGE
-    text = page("all folds (test)", f"{table.html()}<h2>Jobs</h2>{jobs.html()}", notes=notes)
-    atomic_write(file, text)
-    time_ms = now_ms()
-    # If runs also differ in other settings, or folds are missing, only the page has their figures.
-    groups = {
-        title: TEST_METRICS if title == AGENT else metric_prefix(title.removesuffix(ALL_FOLDS))
-        for title in table.results
-        if title.endswith(ALL_FOLDS)
-    }
-    shown = [*(column.metric for column in table.quantities), ABOVE_RANDOM]
-    metrics = [
-        Metric(f"{group}/{name}", value, time_ms, 0)
-        for title, group in groups.items()
-        for name, value in table.results[title].shown_metrics(shown).items()
-        if math.isfinite(value)
-    ]
-    store.log_batch(run_id, metrics=metrics)
-    store.log_artifact(run_id, str(file))
-    set_description(store, run_id, "\n\n".join([*notes, table.markdown()]))

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import html
 import json
-import shlex
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -19,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from armscan.config.command_hints import armscan_command, resume_command, run_command
 from armscan.config.credentials import check_address
-from armscan.config.defaults import FOLD, TRACKING_URI, to_plain
+from armscan.config.defaults import TRACKING_URI, to_plain
 from armscan.config.error_messages import one_line_message
 from armscan.config.task import have_same_task
 from armscan.config.trust import needs_trust, untrusted_word
@@ -34,16 +32,13 @@ from armscan.experiment.job import (
 )
 from armscan.launch.launchers import LAUNCHER, check_launcher, prepare_launcher
 from armscan.tracking.tags import FAILURE_TAG, FOLDER_TAG, GRID_TAG, JOB_TAG
-from armscan.utils.files import atomic_write
 from armscan.utils.run_files import LAST_CHECKPOINT, RESULTS_PAGE
-from armscan.utils.text import counted
 
 if TYPE_CHECKING:
     from mlflow.entities import Run
 
     from armscan.tracking import TrackingStore
     from armscan.tracking.outbox import Outbox
-    from armscan.training import ResultTable
 
 # Hydra's own overrides that select the multirun mode and its folder.
 NOT_REPEATED = ("hydra.mode=", "hydra.sweep.dir=", "hydra.sweep.subdir=")
@@ -162,11 +157,12 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
         store, runs = None, []
     if outcomes:
         from armscan.experiment.console import print_jobs, print_where_to_look
+        from armscan.launch.grid_tables import keep_tables
 
         run_ids = {run.data.tags[JOB_TAG]: run.info.run_id for run in runs}
         table = print_jobs(outcomes, run_ids, have_same_task=have_same_task(run.data.params for run in runs))
         if store is not None and runs:
-            _keep_tables(table, folder, parent, outcomes, runs, store)
+            keep_tables(table, folder, parent, outcomes, runs, store)
             print_where_to_look(folder, parent["tracking"]["uri"], files=(RESULTS_PAGE, ""))
             compare = armscan_command("report", "--runs", parent["run_id"], tracking=parent["tracking"]["uri"])
             print(f"compare   {compare}")
@@ -206,71 +202,6 @@ def _print_resume_commands(parent: Mapping[str, Any], runs: Sequence[Run]) -> No
     if runs:
         again = resume_command(parent["run_id"], uri, trust=parent["trust"])
         print(f"resume all with: {again}", file=sys.stderr)
-
-
-def _keep_tables(
-    table: ResultTable,
-    folder: Path,
-    parent: Mapping[str, Any],
-    outcomes: Mapping[str, JobOutcome],
-    runs: Sequence[Run],
-    store: TrackingStore,
-) -> None:
-    """Save the table of the jobs and the one over all folds; an error is only printed, because the grid has ended."""
-    from mlflow.exceptions import MlflowException
-
-    try:
-        if not _pool_folds(table, folder, parent, outcomes, runs, store):
-            _keep_page(table, folder, parent, store)
-    except (TrackingError, MlflowException, OSError) as error:
-        print(f"the tables of the grid are not kept: {one_line_message(error) or error}", file=sys.stderr)
-
-
-def _keep_page(table: ResultTable, folder: Path, parent: Mapping[str, Any], store: TrackingStore) -> None:
-    """Save the table of the jobs as a page, in the grid's folder and with its parent run."""
-    from armscan.reports.html import page
-    from armscan.tracking.uploader import set_description
-
-    file, n_jobs = folder / RESULTS_PAGE, sum(map(bool, table.facts["outcome"]))
-    body = f"<p><code>{html.escape(' '.join(parent['overrides']))}</code></p>{table.html()}"
-    atomic_write(file, page(f"Grid of {counted(n_jobs, 'job')}", body))
-    store.log_artifact(parent["run_id"], str(file))
-    set_description(store, parent["run_id"], table.markdown())
-
-
-def _pool_folds(
-    jobs: ResultTable,
-    folder: Path,
-    parent: Mapping[str, Any],
-    outcomes: Mapping[str, JobOutcome],
-    runs: Sequence[Run],
-    store: TrackingStore,
-) -> bool:
-    """Print one table over all folds of a cross-validation, and save it above the table of the jobs; False without."""
-    from armscan.experiment.console import print_result_table
-    from armscan.experiment.results import few_wrists
-    from armscan.launch.folds_table import folds_table, keep_table
-    from armscan.launch.grid_plan import jobs_of
-
-    if not any(word.startswith(f"{FOLD}=") for word in parent["overrides"]):
-        return False
-    planned = [dict(word.partition("=")[::2] for word in job) for job in jobs_of(parent["overrides"])[1]]
-    finished = [run for run in runs if outcomes[run.data.tags[JOB_TAG]].failure is None]
-    varied = {
-        number: [word for word in shlex.split(outcome.overrides) if word not in parent["common"]]
-        for number, outcome in outcomes.items()
-    }
-    tested = [(Path(run.data.tags[FOLDER_TAG]), varied[run.data.tags[JOB_TAG]]) for run in finished]
-    table = folds_table(tested, len({job[FOLD] for job in planned}))
-    if table is None:
-        return False
-    left_out = len(planned) - len(finished)
-    missing = f"{left_out} of {len(planned)} jobs are missing: the table is over the folds that all seeds tested on"
-    title, of_agent = next(each for each in table.results.items() if each[0].startswith("agent, "))
-    notes = [*([missing] if left_out else []), *few_wrists({"test ": of_agent})]
-    print_result_table(f"{title.split(', ')[1]} (test)", table, notes)
-    keep_table(table, jobs, folder, store, parent["run_id"], notes)
-    return True
 
 
 def _close_parent(

@@ -11,8 +11,9 @@ from armscan.errors import InvalidValueError, VolumeError
 from armscan.experiment.console import jobs_table
 from armscan.experiment.job import JobOutcome
 from armscan.launch.folds_grid import with_folds
-from armscan.launch.folds_table import AGENT, folds_table, keep_table
+from armscan.launch.folds_table import AGENT, folds_table
 from armscan.launch.grid_plan import print_grid_plan
+from armscan.launch.grid_tables import keep_folds_table
 from armscan.tracking.tags import DESCRIPTION_TAG
 from armscan.training import TEST, Evaluation, MetricEstimates
 from armscan.utils.run_files import RESULTS_PAGE
@@ -170,7 +171,7 @@ def test_page_and_description_of_all_folds_say_what_is_missing(tmp_path, databas
     run_id = store.create_run(experiment_id, name="grid", tags={}).info.run_id
     table = table_of([(left_by_a_run(tmp_path / "a", "wrist", [1.0]), "data.fold=0")])
     jobs = jobs_table({"1": JobOutcome("", "data.fold=1", failure="out of memory")}, {}, have_same_task=False)
-    keep_table(table, jobs, tmp_path, store, run_id, ["1 of 2 jobs are missing"])
+    keep_folds_table(table, jobs, tmp_path, store, run_id, ["1 of 2 jobs are missing"])
     shown = (tmp_path / RESULTS_PAGE).read_text()
     assert "<p>1 of 2 jobs are missing</p>" in shown
     of_jobs = shown.partition("<h2>Jobs</h2>")[2]
@@ -193,7 +194,7 @@ def test_grid_has_the_metrics_of_all_folds_alone(tmp_path, database, varied, n_f
     run_id = store.create_run(experiment_id, name="grid", tags={}).info.run_id
     runs = [(left_by_a_run(tmp_path / str(i), "wrist", [1.0]), words.split()) for i, words in enumerate(varied)]
     jobs = jobs_table({"0": JobOutcome("", "data.fold=0", metrics={})}, {}, have_same_task=False)
-    keep_table(folds_table(runs, n_folds), jobs, tmp_path, store, run_id, [])
+    keep_folds_table(folds_table(runs, n_folds), jobs, tmp_path, store, run_id, [])
     run = store.get_run(run_id)
     assert {key.split("/")[0] for key in run.data.metrics} == tracked
     assert DESCRIPTION_TAG in run.data.tags

@@ -1,0 +1,129 @@
+"""Tables of a grid: of its jobs, and over all folds of a cross-validation, kept in its folder and its run."""
+
+from __future__ import annotations
+
+import html
+import math
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from armscan.config.defaults import FOLD
+from armscan.config.error_messages import one_line_message
+from armscan.errors import TrackingError
+from armscan.experiment.console import print_result_table
+from armscan.experiment.job import JobOutcome
+from armscan.experiment.results import few_wrists
+from armscan.launch.folds_table import AGENT, ALL_FOLDS, folds_table
+from armscan.launch.grid_plan import jobs_of
+from armscan.reports.html import page
+from armscan.tracking.outbox import now_ms
+from armscan.tracking.tags import FOLDER_TAG, JOB_TAG
+from armscan.tracking.uploader import set_description
+from armscan.training.episode_results import TEST_METRICS, metric_prefix
+from armscan.training.headline import ABOVE_RANDOM
+from armscan.utils.files import atomic_write
+from armscan.utils.run_files import RESULTS_PAGE
+from armscan.utils.text import counted
+
+if TYPE_CHECKING:
+    from mlflow.entities import Run
+
+    from armscan.tracking import TrackingStore
+    from armscan.training import ResultTable
+
+
+def keep_tables(
+    table: ResultTable,
+    folder: Path,
+    parent: Mapping[str, Any],
+    outcomes: Mapping[str, JobOutcome],
+    runs: Sequence[Run],
+    store: TrackingStore,
+) -> None:
+    """Save the table of the jobs and the one over all folds; an error is only printed, because the grid has ended."""
+    from mlflow.exceptions import MlflowException
+
+    try:
+        if not _pool_folds(table, folder, parent, outcomes, runs, store):
+            n_jobs = counted(sum(map(bool, table.facts["outcome"])), "job")
+            body = f"<p><code>{html.escape(' '.join(parent['overrides']))}</code></p>{table.html()}"
+            _keep_page(folder, page(f"Grid of {n_jobs}", body), table.markdown(), store, parent["run_id"])
+    except (TrackingError, MlflowException, OSError) as error:
+        print(f"the tables of the grid are not kept: {one_line_message(error) or error}", file=sys.stderr)
+
+
+def keep_folds_table(
+    table: ResultTable, jobs: ResultTable, folder: Path, store: TrackingStore, run_id: str, notes: Sequence[str]
+) -> None:
+    """Save the tables of all folds and of the jobs in the grid's folder, and with the figures in the grid's run.
+
+    Args:
+        table: Table of all folds.
+        jobs: Table of the jobs, shown below.
+        folder: Folder of the grid.
+        store: Store of the grid's run.
+        run_id: MLflow run ID of the grid.
+        notes: Notes on the table, such as missing folds.
+
+    Raises:
+        TrackingError: If the store is unavailable.
+    """
+    from mlflow.entities import Metric
+
+    text = page("all folds (test)", f"{table.html()}<h2>Jobs</h2>{jobs.html()}", notes=notes)
+    _keep_page(folder, text, "\n\n".join([*notes, table.markdown()]), store, run_id)
+    time_ms = now_ms()
+    # If runs also differ in other settings, or folds are missing, only the page has their figures.
+    groups = {
+        title: TEST_METRICS if title == AGENT else metric_prefix(title.removesuffix(ALL_FOLDS))
+        for title in table.results
+        if title.endswith(ALL_FOLDS)
+    }
+    shown = [*(column.metric for column in table.quantities), ABOVE_RANDOM]
+    metrics = [
+        Metric(f"{group}/{name}", value, time_ms, 0)
+        for title, group in groups.items()
+        for name, value in table.results[title].shown_metrics(shown).items()
+        if math.isfinite(value)
+    ]
+    store.log_batch(run_id, metrics=metrics)
+
+
+def _keep_page(folder: Path, text: str, description: str, store: TrackingStore, run_id: str) -> None:
+    file = folder / RESULTS_PAGE
+    atomic_write(file, text)
+    store.log_artifact(run_id, str(file))
+    set_description(store, run_id, description)
+
+
+def _pool_folds(
+    jobs: ResultTable,
+    folder: Path,
+    parent: Mapping[str, Any],
+    outcomes: Mapping[str, JobOutcome],
+    runs: Sequence[Run],
+    store: TrackingStore,
+) -> bool:
+    """Print one table over all folds of a cross-validation, and save it above the table of the jobs; False without."""
+    if not any(word.startswith(f"{FOLD}=") for word in parent["overrides"]):
+        return False
+    planned = [dict(word.partition("=")[::2] for word in job) for job in jobs_of(parent["overrides"])[1]]
+    finished = [run for run in runs if outcomes[run.data.tags[JOB_TAG]].failure is None]
+    varied = {
+        number: [word for word in shlex.split(outcome.overrides) if word not in parent["common"]]
+        for number, outcome in outcomes.items()
+    }
+    tested = [(Path(run.data.tags[FOLDER_TAG]), varied[run.data.tags[JOB_TAG]]) for run in finished]
+    table = folds_table(tested, len({job[FOLD] for job in planned}))
+    if table is None:
+        return False
+    left_out = len(planned) - len(finished)
+    missing = f"{left_out} of {len(planned)} jobs are missing: the table is over the folds that all seeds tested on"
+    title, of_agent = next(each for each in table.results.items() if each[0].startswith("agent, "))
+    notes = [*([missing] if left_out else []), *few_wrists({"test ": of_agent})]
+    print_result_table(f"{title.split(', ')[1]} (test)", table, notes)
+    keep_folds_table(table, jobs, folder, store, parent["run_id"], notes)
+    return True
