@@ -274,6 +274,7 @@ def test_run_on_labelmap_files(tmp_path, data_folder):
         ),
         (["obs=cluster,action_reward"], "'obs=cluster,action_reward' gives several values: armscan run -m"),
         (["agent=[sac,ppo]"], "'agent=[sac,ppo]' is not allowed: a run has one agent, agent=NAME"),
+        (["-m", "agent=glob([rand*])", "seed=-1"], "seed is -1, but it must be"),
         (["~data"], "'~data' is not allowed: a run has one data, data=NAME"),
         (["-m", "obs=[cluster],slice", "--plan"], "'obs=[cluster],slice' is not allowed: a run has one obs"),
         (

@@ -88,7 +88,7 @@ def label(
     tracking: str,
     trust: bool,
 ) -> int:
-    """Find the optimal planes of the volumes in FOLDER.
+    """Find a plane for each volume in FOLDER.
 
     Volumes that have a plane are left alone by default. The planes, for a person to accept or reject, are written into
     the manifest, which is created if there is none. docs/labelling.md explains how to check and correct them.
@@ -174,7 +174,7 @@ def _print_dataset(dataset: Dataset, folder: Path) -> None:
         console.print(Text(f"{name}: subject {dataset.subjects[name]}, {split}{plane}", style="bold"))
         console.print(Text(_geometry(report)))
         console.print(_tissue_table(report))
-        for note in (*report.notes, *_coarse_note(report.volume)):
+        for note in (*report.notes, *(_coarse_note(report.volume) if report.has_size_of_an_arm else ())):
             console.print(Text(f"note: {note}"))
     read = {*dataset.reports, *dataset.excluded, *MANIFEST_NAMES, PICTURES}
     if others := sorted(each.name for each in folder.iterdir() if each.name not in read and each.name[0] != "."):
@@ -215,7 +215,7 @@ def _coarse_note(volume: LabelVolume) -> list[str]:
         return []
     (usual_across, usual_depth), (across, depth) = USUAL_PIXEL_MM, volume.pixel_mm
     return [
-        f"pixels of {across:.2g} x {depth:.2g} mm are coarse: clusters merge, so planes that look alike differ by many "
+        f"pixels of {across:.3g} x {depth:.3g} mm are coarse: clusters merge, so planes that look alike differ by many "
         f"degrees; spacing: [{usual_across}, {usual_across}, {usual_depth}] in the manifest resamples the volumes"
     ]
 

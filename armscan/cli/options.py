@@ -149,7 +149,7 @@ trust_option = click.option(
 clustering_option = click.option(
     "--clustering",
     type=click.Choice(["pixels", "metric"]),
-    help="How landmarks are clustered: by pixels, or by mm for volumes whose pixels are not about 0.27 x 0.55 mm.",
+    help="How landmarks are clustered: by pixels, tuned to 0.27 x 0.55 mm, or by mm, for pixels of at most 0.6 mm.",
 )
 
 

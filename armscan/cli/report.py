@@ -24,8 +24,8 @@ PLACES = {"study": "storage", "runs": "tracking"}
 @click.option(
     "--runs",
     metavar="ID,ID,...",
-    help="Compare these runs: MLflow run IDs or their beginnings. A grid or a trial stands for all trainings below "
-    "it, experiment:NAME for an MLflow experiment.",
+    help="Compare these runs: MLflow run IDs or their beginnings. A grid, a study or a trial stands for all "
+    "trainings below it, experiment:NAME for an MLflow experiment.",
 )
 @click.option(
     "--out",
@@ -33,7 +33,7 @@ PLACES = {"study": "storage", "runs": "tracking"}
     metavar="FOLDER",
     help="Folder of the report.  [default: one in reports]",
 )
-@click.option("--watch", is_flag=True, help="Write the report of a study again and again until Ctrl-C; it refreshes.")
+@click.option("--watch", is_flag=True, help="Rewrite the report of a study until Ctrl-C; the browser reloads it.")
 @storage_option(help="Optuna storage of the study.")
 @tracking_option(help="MLflow tracking store of the runs.")
 def report(study: str | None, runs: str | None, out: Path | None, watch: bool, storage: str, tracking: str) -> None:

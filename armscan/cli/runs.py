@@ -22,6 +22,7 @@ from armscan.cli.options import (
     trust_option,
 )
 from armscan.errors import TrackingError, printable
+from armscan.utils.text import counted
 
 if TYPE_CHECKING:
     from armscan.tracking import TrackingStore
@@ -32,7 +33,9 @@ REPRODUCTIONS = Path("reproductions")
 SELECTION = (
     click.option("--experiment", metavar="NAME", help="Only runs of this MLflow experiment."),
     click.option(
-        "--status", type=CommaSeparated("STATUS", STATUSES), help=f"Only runs that are {', '.join(STATUSES)}."
+        "--status",
+        type=CommaSeparated("STATUS", STATUSES),
+        help=f"Only runs with one of these statuses: {', '.join(STATUSES)}.",
     ),
     click.option("--agent", type=CommaSeparated("NAME"), help="Only runs of these agents."),
     click.option("--obs", type=CommaSeparated("NAME"), help="Only runs with these observations."),
@@ -46,7 +49,7 @@ SELECTION = (
         type=click.Choice([f"{sign}{key}" for key in SORTS for sign in ("", "-")]),
         metavar="KEY",
         default="-started",
-        help=f"Sort by {', '.join(SORTS)}; -KEY: descending.",
+        help=f"Sort by {', '.join(SORTS)}; -KEY sorts in descending order. plane: on-plane rate.",
     ),
     click.option("--limit", type=click.IntRange(1), help="Only so many runs."),
 )
@@ -114,13 +117,13 @@ def show(run: str, tracking: str) -> None:
 def prune(what: str, apply: bool, tracking: str, sort: str, limit: int | None, **selected: Any) -> int:
     """Remove checkpoints or folders of ended runs.
 
-    checkpoints: those in their folders. folders: all of their files on this machine. The store is not changed: MLflow
-    deletes runs and artifacts. docs/runs.md says what is never removed.
+    checkpoints: those in their folders; of a failed or killed run, the only copies. folders: all of their files on this
+    machine. The store is not changed: MLflow deletes runs and artifacts. docs/runs.md says what is never removed.
     """
     from rich.filesize import decimal
 
     from armscan.config.command_hints import armscan_command
-    from armscan.runs.prune import plan, remove_planned
+    from armscan.runs.prune import CHECKPOINTS, plan, remove_planned
     from armscan.runs.query import find_runs
     from armscan.runs.rows import RunRow, sort_rows
     from armscan.runs.tables import print_prune_plan
@@ -134,6 +137,8 @@ def prune(what: str, apply: bool, tracking: str, sort: str, limit: int | None, *
     taken = [item for item in items if item.left is None]
     freed = decimal(sum(item.n_bytes for item in taken))
     print(f"{what} of {len(taken)} of {len(items)} runs would be removed, {freed}; nothing was removed")
+    if unfinished := [item for item in taken if what == CHECKPOINTS and item.run.info.status != "FINISHED"]:
+        print(f"note: {counted(len(unfinished), 'run')} did not finish: these checkpoints are the only copies")
     if taken:
         print(f"remove it {armscan_command(*click.get_current_context().obj, '--apply')}")
     return 0
@@ -146,7 +151,8 @@ def prune(what: str, apply: bool, tracking: str, sort: str, limit: int | None, *
 def stop(target: str, storage: str, tracking: str) -> None:
     """Stop a trial, a study, or a run of this machine.
 
-    STUDY is the name of a study: its trials are requeued at their next report, and the same command resumes it.
+    STUDY is the name of a study: its trials are requeued at their next report, and the command that started it resumes
+    it.
     RUN is an MLflow run ID or its first characters. A trial ends at its next report, as pruned, and counts
     as finished; a run outside a study is interrupted as by Ctrl-C.
     """
@@ -178,7 +184,7 @@ def stop(target: str, storage: str, tracking: str) -> None:
 @click.option("--tracking", type=UriParam(), help="MLflow tracking store.  [default: the one that each run names]")
 @trust_option
 def sync(folder: Path, tracking: str | None, trust: bool) -> int:
-    """Upload metrics and files buffered while the tracking server was unreachable.
+    """Upload what runs have not uploaded yet.
 
     FOLDER is the folder of a run, of a study, or above them. Nothing is uploaded twice, and running runs upload
     by themselves. Exit code: 1 if something is left.

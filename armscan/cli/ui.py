@@ -23,7 +23,7 @@ PORT = click.IntRange(1, 65_535)
 def ui(storage: str, tracking: str, artifacts: Path, mlflow_port: int, dashboard_port: int) -> None:
     """Serve MLflow's UI and Optuna's dashboard.
 
-    Both are for this machine alone, until Ctrl-C.
+    Both accept connections from this machine only, and run until Ctrl-C.
 
     A store given by an option must exist; one of the two default stores may be missing. An MLflow server has its own
     UI: only its address is printed.

@@ -94,7 +94,7 @@ def print_where_to_look(
         folder: Folder of the run or multirun.
         tracking_uri: MLflow tracking URI.
         storage: Optuna storage of the study. Default: None, no study.
-        files: Files worth looking at, relative to the folder; the folder itself if there are none.
+        files: Files worth looking at, relative to the folder. Default: the folder itself.
     """
     for file in files:
         print(f"look at   {from_here(folder / file)}")

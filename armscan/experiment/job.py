@@ -147,7 +147,8 @@ def check_choices(words: Sequence[str]) -> None:
     for word in words:
         key, _, value = word.partition("=")
         group = key.lstrip("+~")
-        if group in CHOICES and (key.startswith("~") or "[" in value):
+        is_list = "[" in value and not value.startswith("glob(")
+        if group in CHOICES and (key.startswith("~") or is_list):
             raise InvalidValueError(
                 f"{word!r} is not allowed: a run has one {group}, {group}=NAME (armscan run --help lists the names)"
             )

@@ -45,7 +45,7 @@ EVALUATED = "/success_rate"
 # Of the metrics of a single volume in an evaluation.
 VOLUME_PREFIX = "volume/"
 NAMES = {metric_prefix(name): name for name in (TEST, TRAINING)} | {"validation": LAST_VALIDATION}
-MORE_HELP = "more wrists would help"
+MORE_HELP = "more subjects would help"
 WHAT_HELPS = (
     f"{MORE_HELP}: data.n_validation and data.n_test with phantoms; data=mixed or cross-validation "
     "(data.folds=leave_one_out) with a folder"
@@ -199,13 +199,13 @@ def volume_notes(test: MetricEstimates, validation: MetricEstimates | None = Non
 
 
 def few_wrists(figures: Mapping[str, MetricEstimates], helps: str = MORE_HELP) -> list[str]:
-    """Return a note if intervals come from too few wrists.
+    """Return a note if intervals come from too few subjects.
 
     Args:
-        figures: Metrics by the word that describes the wrists, which ends with a blank, or is empty.
-        helps: What helps. Default: more wrists.
+        figures: Metrics by the word that describes the subjects, which ends with a blank, or is empty.
+        helps: What helps. Default: more subjects.
     """
-    few = [counted(each.n_subjects, f"{of}wrist") for of, each in figures.items() if each.n_subjects < MIN_WRISTS]
+    few = [counted(each.n_subjects, f"{of}subject") for of, each in figures.items() if each.n_subjects < MIN_WRISTS]
     if not few:
         return []
-    return [f"{' and '.join(few)}, fewer than {MIN_WRISTS}: the intervals are too narrow for other wrists; {helps}"]
+    return [f"{' and '.join(few)}, fewer than {MIN_WRISTS}: the intervals are too narrow for other subjects; {helps}"]

@@ -42,6 +42,7 @@ from armscan.utils.run_files import (
     check_free,
     folder_lock,
 )
+from armscan.utils.text import counted
 
 # First seeds of the episodes for each purpose, so that no episode serves two; see also `results`.
 VALIDATION_SEED, VIDEO_SEED = 10**6, 4 * 10**6
@@ -97,7 +98,7 @@ def run_tracked(
         print_sentence(f"{before}{text}")
 
     tell(f"run {tracked.run_id}: {tracked.name}")
-    if names := setup.split.names:
+    if names := setup.split.description:
         tell(names)
     trust = setup.needs_trust
     again = resume_command(tracked.run_id, tracking_uri, trust=trust)
@@ -107,13 +108,14 @@ def run_tracked(
         result = None
         if isinstance(setup.agent, Learner):
             _tell_validation_interval(setup.agent, setup.budget, tell)
-            measured = ", ".join(filter(None, ["validation", f"{setup.budget.validation_episodes} episodes", how]))
+            n_episodes = counted(setup.budget.validation_episodes, "episode")
+            measured = ", ".join(filter(None, ["validation", n_episodes, how]))
             callbacks = [progress_reporter(job_label, measured), tracked]
             result = train_agent(setup, folder, callbacks, run_id=tracked.run_id, tell=tell, earlier=earlier)
             if result.is_solved:
                 n_taken = result.reports[-1].n_env_steps
                 tell(f"solved: stopped at {n_taken:,} of {setup.budget.env_steps:,} steps")
-        tell(f"playing {setup.n_episodes} episodes on the training volumes, and as many on the test volumes")
+        tell(f"playing {counted(setup.n_episodes, 'episode')} on the training volumes, and as many on the test volumes")
         reached = RunResult.of(setup, result)
         if job_label is None:
             policy = f"{how} policy" if how else "policy"

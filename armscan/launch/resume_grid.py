@@ -17,6 +17,7 @@ from omegaconf import DictConfig
 from armscan.config.defaults import FOLD, to_plain
 from armscan.config.task import is_under
 from armscan.config.trust import check_composed
+from armscan.errors import TrackingError
 from armscan.experiment.build import check_keys, set_up
 from armscan.experiment.job import Invocation, Job
 from armscan.experiment.provenance import provenance_files, sha256_tags
@@ -27,7 +28,7 @@ from armscan.tracking import TrackingStore, load_run, open_store
 from armscan.tracking.sanitize import params_of
 from armscan.tracking.tags import FOLDER_TAG, GRID_TAG, JOB_TAG, PARENT_TAG, STUDY_TAG
 from armscan.training import Fingerprints, check_unchanged
-from armscan.utils.run_files import LAST_CHECKPOINT, SHA256_TAGS, VOLUMES_FILE
+from armscan.utils.run_files import LAST_CHECKPOINT
 
 if TYPE_CHECKING:
     from mlflow.entities import Run
@@ -92,12 +93,13 @@ def _check_volumes(
     """
     assert job.repeats is not None
     for run in client.children(experiment_id, job.repeats):
-        if SHA256_TAGS[VOLUMES_FILE] in run.data.tags and _data_in(run.data.params) == _data_in(params):
-            with TemporaryDirectory() as folder:
-                then = load_run(client.uri, run.info.run_id).volumes(Path(folder))
-            assert then is not None
-            check_unchanged({"grid's": _joined(then)}, {"grid's": _joined(now)}, f"run {run.info.run_id} of it had")
-            return
+        if _data_in(run.data.params) != _data_in(params):
+            continue
+        # A run that was killed at its start has no record of its volumes.
+        with contextlib.suppress(TrackingError), TemporaryDirectory() as folder:
+            if (then := load_run(client.uri, run.info.run_id).volumes(Path(folder))) is not None:
+                check_unchanged({"grid's": _joined(then)}, {"grid's": _joined(now)}, f"run {run.info.run_id} of it had")
+                return
 
 
 def _data_in(params: Mapping[str, str]) -> dict[str, str]:

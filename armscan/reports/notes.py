@@ -86,7 +86,7 @@ def _on_wrists(groups: Sequence[Group]) -> Iterator[str]:
         played = [episode for each in evaluations_by_seed(group).values() for episode in each.episodes]
         n_wrists[group.number] = len({episode.subject or episode.volume for episode in played})
     if few := [number for number, n in n_wrists.items() if 0 < n < MIN_WRISTS]:
-        yield f"{_numbered(few, groups)}: fewer than {MIN_WRISTS} test wrists; intervals are too narrow for others."
+        yield f"{_numbered(few, groups)}: fewer than {MIN_WRISTS} test subjects; intervals are too narrow for others."
 
 
 def _on_unfinished(groups: Sequence[Group]) -> Iterator[str]:

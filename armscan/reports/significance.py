@@ -50,7 +50,7 @@ def evaluations_by_seed(group: Group) -> dict[str, Evaluation]:
 
 
 def final_metrics(group: Group) -> MetricEstimates | None:
-    """Return the final metrics of a group, with intervals over seeds, volumes and episodes; None if not evaluated."""
+    """Return the final metrics of a group, with intervals over seeds, subjects and episodes; None if not evaluated."""
     played, random = evaluations_by_seed(group), _baselines(group).get(RANDOM)
     if not played:
         return None

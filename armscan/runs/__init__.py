@@ -1,1 +1,1 @@
-"""The runs of a tracking store: list, show, prune and reproduce them; export and register policies."""
+"""The runs of a tracking store: list, show, stop, prune and reproduce them; export and register policies."""

@@ -1,13 +1,13 @@
-"""Percentile bootstrap intervals of episodes that are grouped by subject, the arm that a volume is of.
+"""Percentile bootstrap intervals of episodes that are grouped by subject, the person that a volume is of.
 
-An interval is for *other* subjects, and episodes on one arm are alike. So a resample draws subjects with replacement,
-then as many episodes of each drawn subject as it has, also with replacement. With one subject this is a bootstrap of
-its episodes, and describes that arm only. With several *seeds* of a training, a resample draws the seeds first; all
-drawn seeds share the drawn subjects, as all seeds were evaluated on the same volumes.
+An interval is for *other* subjects, and episodes on one subject are alike. So a resample draws subjects with
+replacement, then as many episodes of each drawn subject as it has, also with replacement. With one subject this is a
+bootstrap of its episodes, and describes that subject only. With several *seeds* of a training, a resample draws the
+seeds first; all drawn seeds share the drawn subjects, as all seeds were evaluated on the same volumes.
 
-With K subjects, the interval is a little too wide if arms are alike. If they differ, it is too narrow, by about
-sqrt((K - 1) / K) and more for small K: no resampling knows arms that it has never seen. If every episode has the same
-value, as at a success rate of 100 %, it has no width; `wilson` then gives one, for independent episodes.
+With K subjects, the interval is a little too wide if subjects are alike. If they differ, it is too narrow, by about
+sqrt((K - 1) / K) and more for small K: no resampling knows subjects that it has never seen. If every episode has the
+same value, as at a success rate of 100 %, it has no width; `wilson` then gives one, for independent episodes.
 """
 
 from __future__ import annotations

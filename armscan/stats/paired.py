@@ -5,7 +5,7 @@ with random effects, with Satterthwaite's degrees of freedom (1946, doi:10.2307/
 readers and cases (Hillis 2014, doi:10.1002/sim.5926). With two or three seeds their mean square is often small by
 chance; the degrees of freedom are then those of the volumes, which is too many. So the interval is made at least as
 wide as Student's for other seeds alone, and for other subjects alone. Unlike a percentile bootstrap, it is then wide
-enough for few seeds and volumes. Several volumes of one subject (arm) are alike, and count as one: see `of_subjects`.
+enough for few seeds and volumes. Several volumes of one subject are alike, and count as one: see `of_subjects`.
 """
 
 from __future__ import annotations

@@ -62,10 +62,10 @@ def stop_study(uri: str, name: str) -> str:
             study.set_user_attr(STOP, reason())
             n_running += len(study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)))
     if not n_running:
-        return f"study {name}: no trial is running; the same command resumes it, unless it has ended"
+        return f"study {name}: no trial is running; the command that started it resumes it, unless it has ended"
     return (
         f"study {name}: {counted(n_running, 'running trial')} will be requeued at the next report; "
-        "the same command resumes it"
+        "the command that started it resumes it"
     )
 
 

@@ -82,13 +82,11 @@ def _synced(files: Iterable[Path], opened: Callable[[str], TrackingStore], *, tr
                 is_open = outbox.status not in ENDED and _is_dead(run_id, file)
                 if outbox.is_uploaded and not is_open:
                     continue
-                store = stores[uri] = stores.get(uri) or _opened(opened, uri)
-                if is_open:
-                    _end(outbox, store)
-                if isinstance(store, TrackingError):
+                if isinstance(store := stores.get(uri) or _opened(opened, uri), TrackingError):
                     uploads.append(Upload(outbox.folder, run_id, 0, str(store)))
                 else:
-                    uploads.append(_upload_of(outbox, store, trust=trust))
+                    uploads.append(_upload_of(outbox, store, is_open=is_open, trust=trust))
+                stores[uri] = store
         except FileNotFoundError:
             if _is_dead(file.stem, file) and (left := _end_removed(file.stem, opened)) is not None:
                 uploads.append(Upload(file.parent.parent, file.stem, 0, left))
@@ -103,19 +101,6 @@ def _is_dead(run_id: str, file: Path) -> bool:
     """Return whether the process that wrote this outbox of a run has died on this machine."""
     note = Note.of(run_id)
     return note is not None and note.is_dead and note.outbox.resolve() == file.resolve()
-
-
-def _end(outbox: Outbox, store: TrackingStore | TrackingError) -> None:
-    """Add the end of a run whose process died: FAILED, unless the store has another, as an interrupted grid's jobs."""
-    if isinstance(store, TrackingStore):
-        # Any error of the store: the upload reports it.
-        with contextlib.suppress(Exception):
-            told = store.get_run(outbox.address.run_id).info
-            if told.status in ENDED:
-                outbox.add(status=(told.status, told.end_time or now_ms()))
-                return
-    outbox.add(tags={FAILURE_TAG: PROCESS_DIED})
-    outbox.add(status=("FAILED", now_ms()))
 
 
 def _end_removed(run_id: str, opened: Callable[[str], TrackingStore]) -> str | None:
@@ -144,13 +129,15 @@ def _opened(opened: Callable[[str], TrackingStore], uri: str) -> TrackingStore |
         return TrackingError(str(error))
 
 
-def _upload_of(outbox: Outbox, store: TrackingStore, *, trust: bool) -> Upload:
+def _upload_of(outbox: Outbox, store: TrackingStore, *, is_open: bool, trust: bool) -> Upload:
     n_entries, left = 0, None
     try:
         run = store.get_run(outbox.address.run_id)
         store.check_artifacts_of(run)
         if not trust:
             _check_own(outbox, run)
+        if is_open:
+            _end(outbox, run)
     # Any error of the store, or an untrusted folder.
     except Exception as error:
         return Upload(outbox.folder, outbox.address.run_id, 0, reason_in(error))
@@ -161,6 +148,17 @@ def _upload_of(outbox: Outbox, store: TrackingStore, *, trust: bool) -> Upload:
         except Exception as error:
             left = reason_in(error)
     return Upload(outbox.folder, outbox.address.run_id, n_entries, left)
+
+
+def _end(outbox: Outbox, run: Run) -> None:
+    """Add the end of a run whose process died: FAILED, unless the store has a later one, as of an interrupted grid."""
+    # A resumed run has begun again.
+    begun_ms = max((each["status"][1] for each in outbox.entries() if "status" in each), default=0)
+    if run.info.status in ENDED and run.info.end_time is not None and run.info.end_time >= begun_ms:
+        outbox.add(status=(run.info.status, run.info.end_time))
+    else:
+        outbox.add(tags={FAILURE_TAG: PROCESS_DIED})
+        outbox.add(status=("FAILED", now_ms()))
 
 
 def _check_own(outbox: Outbox, run: Run) -> None:

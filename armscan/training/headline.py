@@ -110,7 +110,7 @@ def _verdict(above: Estimate | None) -> str:
     points = Estimate(*(100 * each for each in above))
     size = f"{points.value:+.1f} points"
     if math.isnan(points.low):
-        return f"Difference {size}, one wrist and one seed: this allows no conclusion about others."
+        return f"Difference {size}, one subject and one seed: this allows no conclusion about others."
     interval = f"{size} ({points.low:+.1f} to {points.high:+.1f})"
     if points.low > 0:
         return f"Better than random: {interval}."

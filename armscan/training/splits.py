@@ -80,8 +80,8 @@ class Split:
         return {part: getattr(self, part) for part in PARTS}
 
     @property
-    def names(self) -> str | None:
-        """The names of the volumes in each part, phantoms only counted; None if all are phantoms."""
+    def description(self) -> str | None:
+        """The names of the volumes in each part in one line, phantoms only counted; None if all are phantoms."""
         if all(PHANTOM_NAME.fullmatch(name) for volumes in self.parts.values() for name in volumes):
             return None
         of_parts = []

@@ -127,7 +127,7 @@ def outcome(episode: EpisodeResult) -> str:
     """Return the outcome of an episode as a string."""
     how = "success" if episode.is_success else "no success"
     off = f"{episode.distance_mm:.1f} mm and {episode.distance_deg:.1f}°"
-    return f"{how} after {counted(episode.n_steps, 'step')}, {off} from the optimal plane"
+    return f"{how} after {counted(episode.n_steps, 'step')}, {off} from the labelled plane"
 
 
 def record_episode(agent: Agent, env: Env, path: Path, *, seed: int) -> None:

@@ -40,9 +40,9 @@ def _subjects(value: Any) -> tuple[str, ...]:
 
 
 def _spacing(value: Any) -> str | Spacing:
-    if isinstance(value, str):
-        if value in SPACINGS:
-            return value
+    if isinstance(value, str) and value in SPACINGS:
+        return value
+    if not isinstance(value, list | tuple):
         raise InvalidValueError(f"spacing is {value!r}, but it must be {listed([*SPACINGS, '(sx, sy, sz) in mm'])}")
     s_x, s_y, s_z = check_numbers("spacing", value, 3, "(sx, sy, sz) in mm")
     if min(s_x, s_y, s_z) <= 0:

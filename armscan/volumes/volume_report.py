@@ -67,8 +67,8 @@ class VolumeReport:
     def notes(self) -> list[str]:
         """Notes on a size that no arm has, and on axes that may differ from those of phantoms, one sentence each."""
         notes, size_mm = [], self.volume.size_mm
-        if not SMALLEST_MM <= max(size_mm) <= LARGEST_MM:
-            sizes = " x ".join(f"{mm:.2g}" for mm in size_mm)
+        if not self.has_size_of_an_arm:
+            sizes = " x ".join(f"{mm:.0f}" if mm >= 10 else f"{mm:.2g}" for mm in size_mm)
             notes.append(f"the volume is {sizes} mm large: is the spacing in its file in mm?")
         if size_mm[1] < max(size_mm):
             sizes = " x ".join(f"{mm:.0f}" for mm in size_mm)
@@ -76,6 +76,11 @@ class VolumeReport:
         if not self._has_palm_at_high_z():
             notes.append("the palm is at low z, in phantoms at high z; orientation in the manifest flips axes")
         return notes
+
+    @property
+    def has_size_of_an_arm(self) -> bool:
+        """Whether an arm can be as long as the longest side."""
+        return SMALLEST_MM <= max(self.volume.size_mm) <= LARGEST_MM
 
     def _has_palm_at_high_z(self) -> bool:
         """Return whether the tendons lie at higher z than the bones on average."""

@@ -45,7 +45,7 @@ def stops_of(study):
 
 
 def test_study_is_stopped_by_its_name_and_by_its_run(answer, study, run_with):
-    line = "study a: 1 running trial will be requeued at the next report; the same command resumes it\n"
+    line = "study a: 1 running trial will be requeued at the next report; the command that started it resumes it\n"
     assert answer("a") == (0, line, "")
     assert stops_of(study)[1]
     study.set_user_attr("stop", "")
@@ -55,7 +55,8 @@ def test_study_is_stopped_by_its_name_and_by_its_run(answer, study, run_with):
 
 def test_stopped_study_without_a_running_trial_says_so(answer, study):
     study.tell(0, 1.0)
-    assert answer("a") == (0, "study a: no trial is running; the same command resumes it, unless it has ended\n", "")
+    line = "study a: no trial is running; the command that started it resumes it, unless it has ended\n"
+    assert answer("a") == (0, line, "")
 
 
 def test_trial_is_stopped_by_its_run(answer, study, run_with):

@@ -20,7 +20,12 @@ def test_agent_that_is_a_baseline_has_one_row():
 
 @pytest.mark.parametrize(
     ("n_test", "n_validation", "few"),
-    [(8, 8, None), (8, None, None), (8, 4, "4 validation wrists"), (1, 4, "1 test wrist and 4 validation wrists")],
+    [
+        (8, 8, None),
+        (8, None, None),
+        (8, 4, "4 validation subjects"),
+        (1, 4, "1 test subject and 4 validation subjects"),
+    ],
 )
 def test_few_volumes_are_said_in_one_line(n_test, n_validation, few):
     test, validation = (
@@ -42,7 +47,7 @@ def test_subjects_are_those_of_the_evaluations_that_know_them(is_first):
 def test_volumes_of_one_subject_are_one_wrist():
     of_pairs = tuple(replace(each, subject=str(int(each.volume[1:]) // 2)) for each in made_episodes(0, n_volumes=8))
     figures = MetricEstimates.of(Evaluation(of_pairs))
-    assert volume_notes(figures)[0].startswith("4 test wrists, fewer than 8")
+    assert volume_notes(figures)[0].startswith("4 test subjects, fewer than 8")
     assert "8 (4 subjects)" in ResultTable({"agent": figures}).markdown()
     of_pair_names = tuple(replace(each, volume=each.subject, subject=None) for each in of_pairs)
     assert figures.estimates == MetricEstimates.of(Evaluation(of_pair_names)).estimates

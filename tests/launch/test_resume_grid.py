@@ -47,7 +47,7 @@ def test_earlier_run_is_of_the_repeated_grid_and_never_of_a_study_or_another_gri
     assert {*found} == {ours, alone, of_repetition}
 
 
-@pytest.mark.parametrize("change", ["new", "changed", None])
+@pytest.mark.parametrize("change", ["new", "changed", "lost", None])
 def test_grid_goes_on_with_the_same_volumes_alone(tmp_path, database, change):
     words = [*FEW, f"tracking.uri=sqlite:///{tmp_path}/mlruns.db"]
     config = compose([*words, "seed=1"])
@@ -65,18 +65,19 @@ def test_grid_goes_on_with_the_same_volumes_alone(tmp_path, database, change):
     with TrackedRun.start(
         client, experiment_id, name="0", config=to_plain(compose(words)), tags=tags, folder=tmp_path
     ) as run:
-        run.log_files(tmp_path / VOLUMES_FILE)
+        if change != "lost":
+            run.log_files(tmp_path / VOLUMES_FILE)
     job = Job(1, "", "", "2" * 32, tmp_path, repeats="1" * 32, is_trusted=False)
     begun = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("armscan.launch.resume_grid.run_experiment", lambda *_: begun.append(1))
-        if change is None:
+        if change in ("lost", None):
             run_again(config, Invocation(tmp_path, [], "", {}, job), job)
         else:
             what = f"the grid's volumes are not those that run {run.run_id} of it had: {name} is {change}"
             with pytest.raises(ChangedVolumesError, match=what):
                 run_again(config, Invocation(tmp_path, [], "", {}, job), job)
-    assert bool(begun) == (change is None)
+    assert bool(begun) == (change in ("lost", None))
 
 
 def test_job_of_a_stored_command_line_builds_no_class_of_others(tmp_path):

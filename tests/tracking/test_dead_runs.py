@@ -1,5 +1,6 @@
 """Runs whose process was killed: the next process ends them, if the process was of this machine and is gone."""
 
+import contextlib
 import json
 import multiprocessing
 import os
@@ -12,6 +13,7 @@ from mlflow import MlflowClient
 
 from armscan.tracking import TrackedRun, open_existing_store, open_store, sync
 from armscan.tracking.notes import NOTES_FOLDER, notes
+from armscan.tracking.outbox import Outbox, file_of, now_ms
 from armscan.tracking.sync import FOLDER_REMOVED, PROCESS_DIED, _upload_pending
 from armscan.utils.processes import ProcessInfo
 from tests.support.waiting import HANG_S
@@ -75,10 +77,22 @@ def test_end_that_the_store_has_already_stays(uri, run_id, tmp_path):
     store.set_tag(run_id, "failure", "interrupted")
     store.set_terminated(run_id, "KILLED")
     ended_ms = store.get_run(run_id).info.end_time
-    _upload_pending(store)
+    other, _ = open_store(f"sqlite:///{tmp_path}/other.db", experiment="a", artifacts=str(tmp_path), wait_s=1.0)
+    for each in (other, store):
+        _upload_pending(each)
     assert not any(upload.left for upload in sync(tmp_path, open_existing_store))
     assert ending_of(uri, run_id) == ("KILLED", "interrupted")
     assert store.get_run(run_id).info.end_time == ended_ms
+
+
+def test_end_before_the_run_was_resumed_is_not_its_end(uri, run_id, tmp_path):
+    store = open_existing_store(uri)
+    store.set_tag(run_id, "failure", "interrupted")
+    store.set_terminated(run_id, "KILLED")
+    with contextlib.closing(Outbox(file_of(tmp_path / "run", run_id))) as outbox:
+        outbox.add(status=("RUNNING", now_ms() + 1000))
+    assert not any(upload.left for upload in sync(tmp_path, open_existing_store))
+    assert ending_of(uri, run_id) == ("FAILED", PROCESS_DIED)
 
 
 @pytest.mark.parametrize("is_removed", [False, True])

@@ -14,7 +14,7 @@ from types import SimpleNamespace
 from unittest.mock import Mock
 
 import pytest
-from mlflow.store.tracking.dbmodels.initial_models import Base as InitialBase
+from sqlalchemy import Engine, event
 
 import armscan
 from armscan.errors import InvalidValueError, TrackingError, UntrustedError
@@ -390,17 +390,21 @@ def test_open_existing_store_makes_nothing(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_store_whose_tables_were_being_created_when_it_was_interrupted_is_created_anew(tmp_path, monkeypatch):
-    def begin(engine):
-        InitialBase.metadata.create_all(engine)
-        raise KeyboardInterrupt
+def test_store_whose_tables_were_being_created_when_it_was_interrupted_is_created_anew(tmp_path):
+    statements = []
+
+    def interrupt(*_):
+        statements.append(1)
+        # Within a migration, from which MLflow does not recover.
+        if len(statements) == 100:
+            raise KeyboardInterrupt
 
     uri = f"sqlite:///{tmp_path}/runs.db"
     opened = functools.partial(open_store, uri, experiment="test", artifacts=str(tmp_path), wait_s=1.0)
-    with monkeypatch.context() as patch:
-        patch.setattr("mlflow.store.db.utils._initialize_tables", begin)
-        with pytest.raises(KeyboardInterrupt):
-            opened()
+    event.listen(Engine, "after_cursor_execute", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        opened()
+    event.remove(Engine, "after_cursor_execute", interrupt)
     store, experiment_id = opened()
     assert store.get_experiment(experiment_id).name == "test"
 

@@ -31,9 +31,9 @@ def test_phantoms_are_of_the_version_that_the_data_names():
 
 
 def test_split_names_volumes_of_files_and_counts_phantoms(folder):
-    assert phantom_data(n_training=2, n_validation=1, n_test=1).names is None
+    assert phantom_data(n_training=2, n_validation=1, n_test=1).description is None
     split = mixed_data(folder(), validation="phantoms", test=["V"], n_training=1, n_validation=2)
-    assert split.names == (
+    assert split.description == (
         "training: a.nrrd, b.nrrd, c.nrrd, d.nrrd, e.nrrd and 1 phantom; validation: 2 phantoms; test: f.nrrd"
     )
 

@@ -341,7 +341,7 @@ def test_note_on_a_study_says_which_settings_how_sure_and_what_helps(storage_uri
     assert rest[2] == "Trial 1 and the control, both with the same 3 new seeds:"
     difference = judge(final).differences[0].row()
     assert rest[3].splitlines()[2] == f"| {' | '.join(difference.values())} |"
-    assert rest[-1].startswith("Note: 3 test wrists, fewer than 8")
+    assert rest[-1].startswith("Note: 3 test subjects, fewer than 8")
 
 
 def test_one_judge_seed_gives_a_difference_without_interval_and_the_result_says_so(storage_uri):
