@@ -77,7 +77,8 @@ class EvaluationReport:
         """Return the tables of agent and baselines, by the name of the volumes."""
         tables = {}
         for label, figures in self.by_split.items():
-            baselines = {name: each[label] for name, each in self.baselines_by_split.items()}
+            # A run's own baselines play on the test volumes alone.
+            baselines = {name: each[label] for name, each in self.baselines_by_split.items() if label in each}
             random = {AGENT: baselines[RANDOM]} if RANDOM in baselines else {}
             tables[label] = ResultTable({AGENT: figures, **baselines}, headline=headline({AGENT: figures}, random))
         return tables

@@ -6,6 +6,7 @@ import json
 import shutil
 import socket
 from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -72,7 +73,7 @@ def start_tracking(
     # Before the run exists, so that it can be resumed whenever it is killed.
     for name, contents in files.items():
         atomic_write(invocation.folder / name, contents)
-    tracked = TrackedRun.start(
+    started = TrackedRun.start(
         client,
         experiment_id,
         name=run_name(resolved, choices),
@@ -95,8 +96,12 @@ def start_tracking(
         folder=invocation.folder,
         parent_id=job.parent_run_id if job else None,
     )
-    tracked.log_datasets(setup.fingerprints)
-    tracked.log_files(*(invocation.folder / name for name in files))
+    with ExitStack() as stack:
+        tracked = stack.enter_context(started)
+        tracked.log_datasets(setup.fingerprints)
+        tracked.log_files(*(invocation.folder / name for name in files))
+        # It stays open, unless it was interrupted.
+        stack.pop_all()
     return tracked
 
 

@@ -199,13 +199,13 @@ def volume_notes(test: MetricEstimates, validation: MetricEstimates | None = Non
 
 
 def few_wrists(figures: Mapping[str, MetricEstimates], helps: str = MORE_HELP) -> list[str]:
-    """Return a note if intervals come from too few subjects.
+    """Return a note if intervals come from too few subjects, as far as their number is known.
 
     Args:
         figures: Metrics by the word that describes the subjects, which ends with a blank, or is empty.
         helps: What helps. Default: more subjects.
     """
-    few = [counted(each.n_subjects, f"{of}subject") for of, each in figures.items() if each.n_subjects < MIN_WRISTS]
+    few = [counted(each.n_subjects, f"{of}subject") for of, each in figures.items() if 0 < each.n_subjects < MIN_WRISTS]
     if not few:
         return []
     return [f"{' and '.join(few)}, fewer than {MIN_WRISTS}: the intervals are too narrow for other subjects; {helps}"]

@@ -102,7 +102,7 @@ def run_tracked(
         tell(names)
     trust = setup.needs_trust
     again = resume_command(tracked.run_id, tracking_uri, trust=trust)
-    hint = _resume_hint_on_error(again, folder, is_told=job_label is None)
+    hint = _resume_hint_on_error(tracked, again, folder, is_told=job_label is None)
     with hint, tracked, named_if_full(folder):
         how = getattr(setup.agent, "validation_note", None)
         result = None
@@ -222,11 +222,13 @@ def log_result(tracked: TrackedRun, result: TrainingResult | None, reached: RunR
 
 
 @contextlib.contextmanager
-def _resume_hint_on_error(command: str, folder: Path, *, is_told: bool) -> Iterator[None]:
-    """Print the command that resumes the run, if an error ends it and it has a checkpoint."""
+def _resume_hint_on_error(tracked: TrackedRun, command: str, folder: Path, *, is_told: bool) -> Iterator[None]:
+    """Print the command that resumes the run, if an error ends it and it has a checkpoint; or uploads its end."""
     try:
         yield
     except BaseException:
-        if is_told and (folder / LAST_CHECKPOINT).exists():
+        if is_told and tracked.is_finished:
+            print(f"upload the rest with: {armscan_command('runs', 'sync', str(folder))}", file=sys.stderr)
+        elif is_told and (folder / LAST_CHECKPOINT).exists():
             print(f"resume with: {command}", file=sys.stderr)
         raise

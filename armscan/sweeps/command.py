@@ -19,7 +19,7 @@ from armscan.sweeps.study.final_eval_storage import stored_final_eval
 from armscan.sweeps.study.open import open_for_work
 from armscan.sweeps.study.plan import print_plan
 from armscan.sweeps.study.population import population_of
-from armscan.sweeps.study.study import existing_study, fixed_config
+from armscan.sweeps.study.study import existing_study, fixed_config, is_reconfigured
 from armscan.sweeps.study.warm_start import initial_trials
 from armscan.sweeps.tasks.attempt import volume_sums, volumes_of
 from armscan.sweeps.workers.launch import run_workers
@@ -56,7 +56,14 @@ def run_study(arguments: Sequence[str], launch: Callable[[Sequence[str]], object
     check_space(settings, task, overrides, config)
     initial = initial_trials(settings, overrides, fixed, existing)
     if given.is_plan:
-        final = stored_final_eval(storage, existing) if storage is not None and existing is not None else None
+        final = None
+        if storage is not None and existing is not None:
+            final = stored_final_eval(storage, existing)
+            if final is not None and is_reconfigured(existing, settings, fixed):
+                print_sentence(
+                    "the configuration has changed: all final trainings begin anew, and open the test volumes"
+                )
+                final = None
         print_plan(settings, existing, final, initial)
         return 0
     opened = open_for_work(settings, task, config, overrides, volumes=volumes)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
@@ -89,7 +90,11 @@ class TrackedRun:
         parent = {PARENT_TAG: parent_id} if parent_id else {}
         run = store.create_run(experiment_id, name=name, tags={**code_state().tags, **tags, **parent})
         tracked = cls.open_existing(store, run.info.run_id, name=name, folder=folder)
-        tracked._log_config(config)
+        with ExitStack() as stack:
+            stack.enter_context(tracked)
+            tracked._log_config(config)
+            # It stays open, unless it was interrupted.
+            stack.pop_all()
         return tracked
 
     @classmethod
@@ -252,6 +257,11 @@ class TrackedRun:
         # A full disk may have ended the run: report that error; the next start closes the run.
         except OSError as failure:
             log(f"run {self.run_id}: its end is not noted ({failure.strerror})")
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether the run has ended as FINISHED, uploaded or not."""
+        return self._outbox.status == "FINISHED"
 
     def resume(self) -> None:
         """Mark the run as RUNNING again, even if it was closed after its last process died."""

@@ -42,7 +42,7 @@ class Callback(Protocol):
         """Handle the start, called once before the first step.
 
         Args:
-            total_env_steps: Environment steps that training may take.
+            total_env_steps: Environment steps that training may take, whole collections.
             earlier: Epochs before the interruption of a resumed training; some may have been reported already.
         """
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
@@ -135,11 +136,13 @@ def train(
     reports = list(earlier)
     start_s = time.perf_counter() - (reports[-1].wall_s if reports else 0.0)
     is_solved = budget.solved is not None and budget.solved.holds(reports)
+    n_at_once = learner.env_steps_at_once
+    rounded_up = math.ceil(budget.env_steps / n_at_once) * n_at_once
     with ExitStack() as stack:
         for callback in callbacks:
             # Also called if a later callback fails to start.
             stack.callback(callback.on_end)
-            callback.on_start(budget.env_steps, tuple(reports))
+            callback.on_start(rounded_up, tuple(reports))
         if not reports:
             learner.warm_up()
         end = min(budget.env_steps, until_env_steps or budget.env_steps)

@@ -88,15 +88,18 @@ def test_policy_is_registered_with_the_figures_of_its_run(answer, armscan, tmp_p
     models = [mlflow.pyfunc.load_model(uri) for uri in ("models:/wrist plane/1", f"runs:/{run_id}/policy")]
     np.testing.assert_array_equal(*(model.predict(model.input_example) for model in models))
 
-    contents = {"test volumes": evaluation_of(2, 4).to_dict()}
-    (tmp_path / "evaluation.json").write_text(json.dumps(contents))
-    client.log_artifact(run_id, str(tmp_path / "evaluation.json"))
+    # As a run leaves them.
+    played = evaluation_of(2, 4).to_dict()
+    contents = {"evaluation": {"training volumes": played, "test volumes": played}, "baselines": {"random": played}}
+    for name, each in contents.items():
+        (tmp_path / f"{name}.json").write_text(json.dumps(each))
+        client.log_artifact(run_id, str(tmp_path / f"{name}.json"))
     made_at = client.get_run(run_id).info.end_time
     assert answer("register", run_id, "--name=wrist plane")[0] == 0
     second = client.get_model_version("wrist plane", "2")
     assert "### at the end of the run\n\nOn plane, 5 mm 10°: agent 100.0% " in second.description
-    assert "\n\n| with 95 % intervals | test volumes |" in second.description
-    assert "| steps, mean | 3.00 (2.00–4.00) |" in second.description
+    assert "\n\n| with 95 % intervals | training volumes | test volumes | random: test volumes |" in second.description
+    assert "| steps, mean | 3.00 (2.00–4.00) | 3.00 (2.00–4.00) | 3.00 (2.00–4.00) |" in second.description
     assert second.tags["test_volumes/mean_steps"] == "3"
     assert second.source == first.source
     assert str(client.get_model_version_by_alias("wrist plane", "champion").version) == "2"

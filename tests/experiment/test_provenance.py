@@ -1,5 +1,7 @@
 """The files that describe the origin of a run."""
 
+from unittest.mock import Mock
+
 import pytest
 
 from armscan.config.compose import compose_run
@@ -7,7 +9,7 @@ from armscan.experiment.build import set_up
 from armscan.experiment.job import Invocation
 from armscan.experiment.provenance import start_tracking
 from armscan.runs.query import projection_of
-from armscan.tracking import open_existing_store
+from armscan.tracking import TrackedRun, open_existing_store
 from armscan.tracking.git import CodeState
 from tests.support.tracked_runs import FEW
 
@@ -30,6 +32,17 @@ def test_name_and_tags_of_a_run_are_of_its_environment(tmp_path, database, monke
     assert run.info.run_name == name
     assert run.data.tags["choice.obs"] == name.split("-")[1]
     assert projection_of(run) == name.split("-")[2]
+
+
+def test_run_that_is_interrupted_while_it_is_created_is_closed(tmp_path, database, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(TrackedRun, "log_datasets", Mock(side_effect=KeyboardInterrupt))
+    config, choices = compose_run([*FEW, "agent=random"])
+    with pytest.raises(KeyboardInterrupt):
+        start_tracking(config, Invocation(tmp_path, [], "", choices, None), set_up(config))
+    client = open_existing_store(database)
+    (run,) = client.search_runs([each.experiment_id for each in client.search_experiments()])
+    assert (run.info.status, run.data.tags["failure"]) == ("KILLED", "interrupted")
 
 
 def test_new_run_keeps_nothing_of_an_earlier_one_in_its_folder(tmp_path, database, monkeypatch):

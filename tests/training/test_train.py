@@ -47,6 +47,8 @@ def evaluation_of(*lengths, success=True, distance_mm=1.0):
 
 
 class ScriptedLearner:
+    env_steps_at_once = 1
+
     def __init__(self):
         self.n_env_steps = 0
         self.asked = []

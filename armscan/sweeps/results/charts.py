@@ -22,9 +22,12 @@ from armscan.sweeps.scheduling.state import is_feasible
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.reports import reports_of
 from armscan.training.metric_display import is_rate, title_of
+from armscan.utils.text import counted
 
 HEIGHT_PX, SMALL_PX, BAR_PX = 360, 260, 34
 MAX_TICKS = 20
+# Trials from which on importances say something.
+ENOUGH = 50
 # Room on either side of a range, as a share of it.
 MARGIN = 0.03
 LEGEND = {"orientation": "h", "y": 1.02, "yanchor": "bottom", "x": 0}
@@ -60,13 +63,22 @@ def charts_of(
         better = "Higher" if direction == StudyDirection.MAXIMIZE else "Lower"
         yield _titled(f"History: {title}", _history(complete, number, objective, direction), f"{better} is better.")
         if rows := [row for row in shares if row["objective"] == objective]:
-            said = "The share of the differences between trials that each key explains (PED-ANOVA)."
-            yield _titled(f"Importance of each key: {title}", _importance(rows), said)
+            yield _titled(f"Importance of each key: {title}", _importance(rows), _on_importance(len(complete)))
         keys = list(dict.fromkeys(key for trial in complete for key in trial.params))
         drawn = "".join(chart(_slice(complete, key, number, objective)) for key in keys)
         yield f'<h2>Slices of the space: {title}</h2><div class="charts">{drawn}</div>'
         figure = plot_parallel_coordinate(study, target=_value(number), target_name=title_of(objective))
+        # Optuna's own scale ends in white, which hides the worst trials.
+        figure.update_traces(line_colorscale="Viridis")
         yield f"<h2>Parallel coordinates: {title}</h2>{chart(figure.update_layout(height=HEIGHT_PX), is_wide=True)}"
+
+
+def _on_importance(n_trials: int) -> str:
+    said = (
+        "How much each key sets the best tenth of the trials apart from the others (PED-ANOVA), relative to the other "
+        "keys. A key that only tells bad trials from worse ones gets little."
+    )
+    return said + (f" {counted(n_trials, 'trial')} say little: some fifty are required." if n_trials < ENOUGH else "")
 
 
 def _titled(heading: str, figure: Figure, said: str = "") -> str:

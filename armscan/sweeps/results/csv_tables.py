@@ -140,7 +140,7 @@ def _result_rows(found: Sequence[ConfigResult]) -> Iterator[Row]:
 
 
 def _importance_rows(study: optuna.Study, objectives: Sequence[str]) -> list[Row]:
-    """Return the share of the differences between trials that each key explains; empty if too few have finished."""
+    """Return how much each key sets the best trials apart, relative to all keys; empty if too few have finished."""
     # PED-ANOVA: Watanabe et al. 2023, arXiv:2304.10255.
     rows: list[Row] = []
     if len(study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))) < MIN_TRIALS_FOR_IMPORTANCE:

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import optuna
 from numpy.typing import NDArray
 from optuna.trial import FrozenTrial, TrialState
 
@@ -14,15 +15,17 @@ from armscan.errors import StudyError
 from armscan.stats.on_plane import limits_among
 from armscan.stats.paired import mean_over_seeds
 from armscan.sweeps.scheduling.state import TEST_PREFIX
-from armscan.sweeps.storage.attribute_names import EPISODES, FINAL_SEED, FINALIST, METRICS
+from armscan.sweeps.storage.attribute_names import EPISODES, FINAL_SEED, FINALIST, FIXED, METRICS
 from armscan.sweeps.study.candidates import name_of
 from armscan.training import TEST, Evaluation, MetricEstimates, ResultTable
 from armscan.training.baselines import RANDOM
 from armscan.training.episode_results import subject_of_volumes
 from armscan.training.headline import beside_random
+from armscan.training.metric_display import bounds_of
 from armscan.training.metrics import COUNTS
 from armscan.training.result_table import with_baselines
 
+STEPS = ("mean_steps", "iqm_steps")
 OF_VOLUME = re.compile(r"test/volume/(.+)/([^/]+)")
 
 
@@ -101,6 +104,12 @@ def _of_means(of_seeds: Sequence[Mapping[str, float]]) -> MetricEstimates:
     # Trials that stored no episodes did not know subjects either.
     n_volumes = len(volumes)
     return MetricEstimates(len(of_seeds), n_volumes, n_volumes, episodes, solved, means, limits_among(means))
+
+
+def bounds_in(search: optuna.Study, metric: str) -> tuple[float, float]:
+    """Return the lowest and highest value of a metric in a study; an episode has at most `env.max_steps`, if fixed."""
+    least, most = bounds_of(metric)
+    return least, search.user_attrs[FIXED].get("env.max_steps", most) if metric in STEPS else most
 
 
 def subjects_of(trials: Sequence[FrozenTrial]) -> dict[str, str]:

@@ -15,7 +15,14 @@ from armscan.experiment.results import volume_notes
 from armscan.stats.aggregation import probability_of_improvement
 from armscan.stats.bootstrap import Estimate
 from armscan.stats.paired import paired_difference
-from armscan.sweeps.results.final_results import ConfigResult, final_results, final_table, scores_of, subjects_of
+from armscan.sweeps.results.final_results import (
+    ConfigResult,
+    bounds_in,
+    final_results,
+    final_table,
+    scores_of,
+    subjects_of,
+)
 from armscan.sweeps.scheduling.state import CONTROL, TEST_PREFIX, metrics_of_test
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.attribute_names import METRICS, OBJECTIVES
@@ -284,5 +291,5 @@ def _differences(
         sign = 1.0 if is_higher_better else -1.0
         probability = probability_of_improvement(sign * ours, sign * theirs)
         paired = paired_difference(ours, theirs, [subject_of.get(volume, volume) for volume in volumes])
-        paired = paired.clipped(-1.0, 1.0) if is_rate(name) else paired
-        yield Difference(name, is_higher_better, paired, probability)
+        least, most = bounds_in(search, name)
+        yield Difference(name, is_higher_better, paired.clipped(least - most, most - least), probability)

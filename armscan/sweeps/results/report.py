@@ -91,8 +91,8 @@ def _summary(study: optuna.Study, state: StudyState, best: Sequence[FrozenTrial]
     text = (
         f"{counted(len(state.finished), 'trial')} finished, {state.n_pruned} of them pruned{violating}; "
         f"{len(state.running)} running, {len(state.failed)} failed, "
-        f"{len(state.retried)} retried after their worker died{taken}. {state.env_steps:,} environment steps in "
-        f"{f'{hours:.1f} hours' if hours >= 1 else f'{60 * hours:.1f} minutes'}."
+        f"{len(state.retried)} retried after their worker died{taken}. They took {state.env_steps:,} environment "
+        f"steps in {f'{hours:.1f} hours' if hours >= 1 else f'{60 * hours:.1f} minutes'}, without the final trainings."
     )
     if ended:
         text += f" The study has ended early: {html.escape(ended)}."

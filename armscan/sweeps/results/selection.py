@@ -13,19 +13,19 @@ from armscan.reports.chart_style import BLUE, GREY, ORANGE, RATE_AXIS
 from armscan.reports.charts import add_estimate
 from armscan.reports.html import chart, table
 from armscan.stats.bootstrap import Estimate
+from armscan.sweeps.results.final_results import bounds_in
 from armscan.sweeps.results.judgement import Judgement
 from armscan.sweeps.scheduling.race import END_LEVEL, Race
 from armscan.sweeps.scheduling.state import CONTROL, StudyState
 from armscan.sweeps.space.parameter import overrides_of
-from armscan.sweeps.storage.attribute_names import FIXED, OBJECTIVES
+from armscan.sweeps.storage.attribute_names import OBJECTIVES
 from armscan.sweeps.study.candidates import NOTHING_SEARCHED, key_of, name_of, settings_of
 from armscan.sweeps.study.final_eval import FinalEvaluation
-from armscan.training.metric_display import bounds_of, is_rate, title_of, value_text
+from armscan.training.metric_display import is_rate, title_of, value_text
 from armscan.utils.text import counted
 
 ROW_PX, AROUND_PX = 44, 110
 # Metrics of the length of an episode.
-STEPS = ("mean_steps", "iqm_steps")
 
 
 class Candidate(NamedTuple):
@@ -84,21 +84,13 @@ def candidates_of(final: FinalEvaluation) -> list[Candidate]:
             Candidate(
                 number,
                 {seed: sign * score for seed, score in sorted(scores.items())},
-                estimate.clipped(*_bounds(final)),
+                estimate.clipped(*bounds_in(final.search, objective_of(final))),
                 standing.n_seeds,
                 _outcome(race, number),
                 " ".join(overrides_of(settings_of(searched, number))),
             )
         )
     return sorted(found, key=lambda each: (each.number != race.chosen, -each.n_seeds, -sign * each.estimate.value))
-
-
-def _bounds(final: FinalEvaluation) -> tuple[float, float]:
-    """Return the lowest and the highest value of the objective; an episode has at most `env.max_steps`, if fixed."""
-    least, most = bounds_of(objective_of(final))
-    if objective_of(final) in STEPS:
-        most = final.search.user_attrs[FIXED].get("env.max_steps", most)
-    return least, most
 
 
 def _outcome(race: Race, number: int) -> str:

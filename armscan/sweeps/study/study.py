@@ -99,6 +99,11 @@ def existing_study(storage: Storage | None, settings: StudySettings, fixed: Mapp
     return study
 
 
+def is_reconfigured(study: optuna.Study, settings: StudySettings, fixed: Mapping[str, Any]) -> bool:
+    """Return whether a stored study would go on with another configuration, and so with new final trainings."""
+    return _check_same(settings, study, comparable_settings(settings, fixed))
+
+
 def _lacks_settings(study: optuna.Study, wanted: Mapping[str, Any]) -> bool:
     """Return whether the process that created a study died before it stored its settings."""
     return not study.user_attrs.keys() >= wanted.keys() and not study.get_trials(deepcopy=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from statistics import fmean
 
 import numpy as np
@@ -55,27 +56,41 @@ class LandmarksTask:
         return self._measured(attempt, "validation")
 
     def evaluate(self, attempt: Attempt) -> dict[str, float]:
-        """Return the metrics on the test volumes. See `Task.evaluate`."""
-        return {f"{TEST_PREFIX}{name}": value for name, value in self._measured(attempt, "test").items()}
+        """Return the metrics on the test volumes, all and each. See `Task.evaluate`."""
+        rewards = self._rewards(attempt, "test")
+        figures = {f"{TEST_PREFIX}{name}": value for name, value in _metrics_of(rewards).items()}
+        for volume, pair in rewards.items():
+            of_volume = _metrics_of({volume: pair})
+            # The worst of all is no mean over the volumes.
+            figures |= {f"{TEST_PREFIX}volume/{volume}/{name}": of_volume[name] for name in METRICS[:-1]}
+        return figures
 
     def _measured(self, attempt: Attempt, part: str) -> dict[str, float]:
-        """Return the metrics on a part of the volumes, by the reward as fitted to the training part."""
+        """Return the metrics on a part of the volumes."""
+        return _metrics_of(self._rewards(attempt, part))
+
+    def _rewards(self, attempt: Attempt, part: str) -> dict[str, tuple[float, float]]:
+        """Return the rewards at the labelled plane of each volume and, on average, elsewhere, as fitted to training."""
         config, _ = attempt.config(attempt.seeds[0])
         tissues, volumes = self._tissues(config), volumes_of(config).parts
         reward = instantiate(config.reward, _convert_="object").fit(volumes["training"].values(), tissues)
-        at_plane, elsewhere = [], []
-        for volume in volumes[part].values():
+        rewards = {}
+        for name, volume in volumes[part].items():
             scorer, labelled = PlaneScorer(volume, reward, tissues), volume.optimal_action
             if labelled is None:
                 raise InvalidValueError(f"{volume.name}: has no labelled plane, which clusterings are judged by")
-            at_plane.append(scorer.score(labelled)[0])
             tx_mm, ty_mm = labelled.translation
             places = np.arange(0.0, volume.size_mm[1], STEP_MM)
             far = [place for place in places if abs(place - ty_mm) > NEAR_MM]
             planes = [ManipulatorAction(labelled.rotation, (tx_mm, float(place))) for place in far]
-            elsewhere.append(fmean(scorer.score(plane)[0] for plane in planes))
-        right, wrong = fmean(at_plane), fmean(elsewhere)
-        return dict(zip(METRICS, (right - wrong, right, wrong, min(at_plane)), strict=True))
+            rewards[name] = scorer.score(labelled)[0], fmean(scorer.score(plane)[0] for plane in planes)
+        return rewards
 
     def _tissues(self, config: DictConfig) -> Tissues:
         return check_tissues(instantiate(config.env.clustering, _convert_="object"))
+
+
+def _metrics_of(rewards: Mapping[str, tuple[float, float]]) -> dict[str, float]:
+    at_plane, elsewhere = zip(*rewards.values(), strict=True)
+    right, wrong = fmean(at_plane), fmean(elsewhere)
+    return dict(zip(METRICS, (right - wrong, right, wrong, min(at_plane)), strict=True))

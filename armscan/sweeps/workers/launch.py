@@ -75,8 +75,7 @@ def run_workers(opened: OpenedStudy, given: StudyCommand, launcher: str, launch:
                 _launch_elsewhere(monitor, folder, launcher, lambda: launch(arguments))
             elif launcher == DEFAULT_LAUNCHER:
                 keep_gpus()
-                with _block_sigint():
-                    launch(arguments)
+                _launch_here(lambda: launch(arguments))
             else:
                 launch(arguments)
 
@@ -98,6 +97,19 @@ def _arguments(opened: OpenedStudy, given: StudyCommand, launcher: str, folder: 
     if launcher == "joblib":
         arguments.append(f"hydra.launcher.n_jobs={n_workers}")
     return arguments
+
+
+def _launch_here(launch: Callable[[], object]) -> None:
+    """Launch workers on this machine by submitit, and print which of them was killed with its supervisor."""
+    # Deferred: only this launcher loads it.
+    from submitit.core.utils import UncompletedJobError
+
+    try:
+        with _block_sigint():
+            launch()
+    # Its trial is requeued; the result says that the study can be resumed.
+    except UncompletedJobError as error:
+        print(f"error: a worker's supervisor was killed: {reason_of(error)}", file=sys.stderr)
 
 
 def _launch_elsewhere(monitor: StudyMonitor, folder: Path, launcher: str, launch: Callable[[], object]) -> None:

@@ -33,6 +33,13 @@ def test_landmarks_of_the_published_clusters_are_there_at_labelled_planes_and_no
     assert task.final_metric in task.evaluate(trial)
 
 
+def test_evaluation_has_the_metrics_of_each_test_volume():
+    figures = LandmarksTask().evaluate(Trial("data.n_test=2"))
+    of_volumes = [value for name, value in figures.items() if name.startswith("test/volume/") and "separation" in name]
+    assert len(of_volumes) == 2
+    assert figures["test/separation"] == pytest.approx(sum(of_volumes) / 2)
+
+
 def test_landmarks_that_cannot_be_told_apart_are_worth_less():
     coarse = Trial("env.clustering.bones.eps_px=8.0", "env.clustering.tendons.eps_px=6.0")
     assert LandmarksTask().run(coarse)["separation"] < LandmarksTask().run(Trial())["separation"]
