@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
+from threading import current_thread, main_thread
+from types import FrameType
 from typing import Any, TypeVar, cast
 
 import numba
@@ -18,8 +21,9 @@ from armscan.utils.log import log
 PACKAGE = Path(__file__).parents[1]
 LOCK_FILE = ".lock"
 Function = TypeVar("Function", bound=Callable[..., Any])
-# A module whose attributes no type checker sees.
+# Modules whose attributes no type checker sees.
 CONFIG: Any = numba.config
+EVENTS: Any = numba.core.event
 
 
 def cached_njit(**options: Any) -> Callable[[Function], Function]:
@@ -94,3 +98,45 @@ class _Note(Listener):
 
     def on_end(self, event: Event) -> None:
         pass
+
+
+class _DeferredSignals(Listener):
+    """Defers Ctrl-C and SIGTERM until a function is compiled: LLVM's callbacks lose exceptions, and compiling fails.
+
+    A second signal is handled at once.
+    """
+
+    def __init__(self) -> None:
+        self._depth = 0
+        self._handlers: dict[int, Callable[..., object]] = {}
+        self._received: tuple[int, FrameType | None] | None = None
+
+    def on_start(self, event: Event) -> None:
+        if current_thread() is not main_thread():
+            return
+        if self._depth == 0:
+            found = {each: signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)}
+            self._handlers = {number: handler for number, handler in found.items() if callable(handler)}
+            for number in self._handlers:
+                signal.signal(number, self._receive)
+        self._depth += 1
+
+    def on_end(self, event: Event) -> None:
+        if current_thread() is not main_thread():
+            return
+        self._depth -= 1
+        if self._depth == 0:
+            for number, handler in self._handlers.items():
+                signal.signal(number, handler)
+            if self._received is not None:
+                (number, frame), self._received = self._received, None
+                self._handlers[number](number, frame)
+
+    def _receive(self, number: int, frame: FrameType | None) -> None:
+        if self._received is None:
+            self._received = number, frame
+        else:
+            self._handlers[number](number, frame)
+
+
+EVENTS.register("numba:compile", _DeferredSignals())

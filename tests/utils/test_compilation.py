@@ -1,5 +1,6 @@
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -9,7 +10,7 @@ import pytest
 from filelock import FileLock, Timeout
 from numba.core.caching import IndexDataCacheFile
 
-from armscan.utils.compilation import LOCK_FILE, PACKAGE, cached_njit
+from armscan.utils.compilation import LOCK_FILE, PACKAGE, _DeferredSignals, cached_njit
 
 CALLER = """
 from armscan.utils.compilation import cached_njit
@@ -87,3 +88,22 @@ def test_the_cache_of_a_compiled_function_is_written_by_one_process_at_a_time(mo
 
     assert four() == 4
     assert len(saved) == 1
+
+
+def test_interrupt_during_compilation_is_handled_at_its_end_and_a_second_one_at_once():
+    deferred = _DeferredSignals()
+    before = signal.getsignal(signal.SIGINT)
+    for n_signals in (1, 2):
+        deferred.on_start(None)
+        # A function that it calls.
+        deferred.on_start(None)
+        signal.raise_signal(signal.SIGINT)
+        if n_signals == 2:
+            with pytest.raises(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGINT)
+        deferred.on_end(None)
+        with pytest.raises(KeyboardInterrupt):
+            deferred.on_end(None)
+        assert signal.getsignal(signal.SIGINT) is before
+    deferred.on_start(None)
+    deferred.on_end(None)
