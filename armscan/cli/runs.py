@@ -241,8 +241,10 @@ def reproduce(run: str, dry_run: bool, out: Path | None, tracking: str, trust: b
     print(f"run {original.run.run_id}: {printable(original.run.name)}")
     for difference in differences:
         print(printable(f"differs: {difference}"))
+    for part in (unknown := reproduction.not_compared(original)):
+        print(f"not compared: {part}")
     if not differences:
-        print("code, packages, machine and volumes are unchanged")
+        print(f"{'' if unknown else 'code, '}packages, machine and volumes are unchanged")
     if dry_run:
         return 1 if differences else 0
     folder = out or REPRODUCTIONS / f"{original.run.run_id[:ID_CHARS]}-{datetime.now():%Y-%m-%d_%H-%M-%S}"

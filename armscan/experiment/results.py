@@ -44,7 +44,11 @@ TITLES = {
 EVALUATED = "/success_rate"
 # Of the metrics of a single volume in an evaluation.
 VOLUME_PREFIX = "volume/"
-NAMES = {metric_prefix(name): name for name in (TEST, TRAINING)} | {"validation": LAST_VALIDATION}
+NAMES = {metric_prefix(name): name for name in (TEST, TRAINING)} | {
+    "validation": LAST_VALIDATION,
+    "difference": "difference from the control",
+    "probability_of_improvement": "probability of improvement on the control",
+}
 MORE_HELP = "more subjects would help"
 WHAT_HELPS = (
     f"{MORE_HELP}: data.n_validation and data.n_test with phantoms; data=mixed or cross-validation "

@@ -69,12 +69,11 @@ def remove(client: TrackingStore, item: PruneItem, what: str) -> str | None:
         RunSkippedError: If the files must now be kept; nothing has been removed.
         OSError: If a file cannot be removed.
     """
-    run_id, parent_id = item.run.info.run_id, item.run.data.tags.get(PARENT_TAG, "")
+    run_id = item.run.info.run_id
     folder = OwnFolder.of(item.run)
     with folder.held():
         # Another process may have begun to use it, or have removed it, since it was planned.
-        condition = f"attributes.run_id IN ('{run_id}', '{parent_id}')"
-        now = {run.info.run_id: run for run in client.runs(experiment_ids(client), condition)}
+        now = _with_ancestors(client, run_id)
         if run_id not in now:
             raise RunSkippedError("it has been deleted meanwhile")
         for file in _files(_folder(now[run_id], now), what):
@@ -110,17 +109,33 @@ def remove_planned(client: TrackingStore, items: Sequence[PruneItem], what: str)
 
 
 def _folder(run: Run, runs: Mapping[str, Run], sharing: Collection[str] = ()) -> OwnFolder:
-    """Return the folder of a run alone; raise if others share it, or the run or its parent, in `runs`, may continue."""
+    """Return the folder of a run alone; raise if others share it, or if it, or one above it in `runs`, may continue."""
     check_version(run)
     if run.info.status not in ENDED:
         raise RunSkippedError(f"it is {run.info.status}, and could be resumed from there")
-    parent = runs.get(run.data.tags.get(PARENT_TAG, ""))
-    if parent is not None and parent.info.status not in ENDED:
-        raise RunSkippedError(f"its parent, run {parent.info.run_id}, is {parent.info.status}, and may resume it")
+    # Above a seed's run are its trial and the study, which may resume it, or copy its checkpoints to other trials.
+    seen, above = {run.info.run_id}, runs.get(run.data.tags.get(PARENT_TAG, ""))
+    while above is not None and above.info.run_id not in seen:
+        if above.info.status not in ENDED:
+            what = "parent" if len(seen) == 1 else "study"
+            raise RunSkippedError(f"its {what}, run {above.info.run_id}, is {above.info.status}, and may resume it")
+        seen.add(above.info.run_id)
+        above = runs.get(above.data.tags.get(PARENT_TAG, ""))
     folder = OwnFolder.of(run)
     if sharing:
         raise RunSkippedError(f"{folder.path} is the folder of run {min(sharing)}, too")
     return folder
+
+
+def _with_ancestors(client: TrackingStore, run_id: str) -> dict[str, Run]:
+    """Return a run and those above it, as the store has them now, by their IDs; empty if it has been deleted."""
+    everywhere, runs = experiment_ids(client), dict[str, Run]()
+    while run_id.isalnum() and run_id not in runs:
+        if not (found := client.runs(everywhere, f"attributes.run_id = '{run_id}'")):
+            break
+        (runs[run_id],) = found
+        run_id = runs[run_id].data.tags.get(PARENT_TAG, "")
+    return runs
 
 
 def _files(folder: OwnFolder, what: str) -> dict[Path, int]:

@@ -100,14 +100,25 @@ def differences(original: Original) -> list[str]:
     before, here = original.environment, environment()
     machine = [key for key in ("python", "platform", "machine") if before.get(key) != here[key]]
     lines += [f"{key} was {before.get(key)}, and is {here[key]}" for key in machine]
-    # armscan's own version adds nothing to the commit.
-    packages = sorted((before["packages"].keys() | here["packages"].keys()) - {"armscan"})
+    # armscan's own version adds nothing to a commit.
+    own = set() if "unknown" in (tags.get(COMMIT), now.get(COMMIT)) else {"armscan"}
+    packages = sorted((before["packages"].keys() | here["packages"].keys()) - own)
     pairs = {name: [each["packages"].get(name, "not installed") for each in (before, here)] for name in packages}
     changed = {name: f"{name} was {then}, and is {now}" for name, (then, now) in pairs.items() if then != now}
     lines += [line for name, line in changed.items() if name in REPORTED_PACKAGES]
     if others := [name for name in changed if name not in REPORTED_PACKAGES]:
         shown = ", ".join(others[:N_SHOWN]) + (", ..." if len(others) > N_SHOWN else "")
         lines.append(f"{len(others)} other packages have other versions, or are there in one case only: {shown}")
+    return lines
+
+
+def not_compared(original: Original) -> list[str]:
+    """Return the parts of a run's code that cannot be compared with today's, in a line each."""
+    lines = []
+    if "unknown" in (original.run.tags.get(COMMIT), code_state().tags.get(COMMIT)):
+        lines.append("the code of armscan, which did not run from a git repository then or does not now")
+    if original.run.needs_trust:
+        lines.append("the code of classes that are not armscan's, which runs do not keep")
     return lines
 
 

@@ -188,8 +188,8 @@ def _cell(result: MetricEstimates, column: Quantity, around: str = "{}") -> tupl
 
 def _count(result: MetricEstimates, name: str) -> str:
     count = getattr(result, name)
-    # Metrics of a validation do not have the number of its volumes.
-    has_count = result.n_episodes and (count or name != "n_volumes")
+    # Metrics of a validation do not have the number of its volumes, and those of a task without episodes none of these.
+    has_count = count if name in ("n_seeds", "n_volumes") else result.n_episodes
     if name == "n_volumes" and 0 < result.n_subjects < count:
         return f"{count} ({counted(result.n_subjects, 'subject')})"
     return str(count) if has_count else MISSING

@@ -98,7 +98,7 @@ def test_policy_is_registered_with_the_figures_of_its_run(answer, armscan, tmp_p
     assert answer("register", run_id, "--name=wrist plane")[0] == 0
     second = client.get_model_version("wrist plane", "2")
     assert "### at the end of the run\n\nOn plane, 5 mm 10°: agent 100.0% " in second.description
-    assert "\n\n| with 95 % intervals | training volumes | test volumes | random: test volumes |" in second.description
+    assert "\n\n| with 95 % intervals | training volumes | test volumes | random, test volumes |" in second.description
     assert "| steps, mean | 3.00 (2.00–4.00) | 3.00 (2.00–4.00) | 3.00 (2.00–4.00) |" in second.description
     assert second.tags["test_volumes/mean_steps"] == "3"
     assert second.source == first.source

@@ -139,6 +139,18 @@ def test_children_of_a_parent_that_is_running_are_left(answer, make_run, store, 
 
 
 @WHAT
+def test_seeds_of_a_finished_trial_of_a_study_that_is_running_are_left(answer, make_run, store, what):
+    client, experiment_id = store
+    study_id, trial_id = (client.create_run(experiment_id, name=name, tags={}).info.run_id for name in "ab")
+    client.set_tag(trial_id, "mlflow.parentRunId", study_id)
+    client.set_terminated(trial_id, "FINISHED")
+    run_id = make_run(parent_id=trial_id)
+    assert_stays(answer, run_id, f"its study, run {study_id}, is RUNNING", what)
+    client.set_terminated(study_id, "FINISHED")
+    assert "1 of 3 runs" in answer("prune", what)[1]
+
+
+@WHAT
 def test_run_that_could_go_on_keeps_its_folder(answer, make_run, store, what):
     run_id = make_run()
     store[0].update_run(run_id, status="RUNNING")

@@ -42,7 +42,7 @@ def test_difference_is_that_of_a_paired_t_test_over_the_volumes():
         ([0.9, 0.8, 0.85, 0.9], [0.5, 0.45, 0.4, 0.5], "Better than random: +40.0 points ("),
         ([0.1, 0.2, 0.1, 0.15], [0.5, 0.45, 0.4, 0.5], "Worse than random: -32.5 points ("),
         ([0.9, 0.1, 0.5, 0.55], [0.5, 0.45, 0.4, 0.5], "Not shown to be better than random: +5.0 points ("),
-        ([0.9], [0.5], "Difference +40.0 points, one wrist and one seed: this allows no conclusion about others."),
+        ([0.9], [0.5], "Difference +40.0 points, one subject and one seed: this allows no conclusion about others."),
     ],
 )
 def test_verdict_follows_the_interval_of_the_difference(rates, random_rates, verdict):

@@ -57,7 +57,8 @@ def charts_of(
     # Optuna draws a front of two or three objectives.
     if len(objectives) in (2, 3):
         figure = plot_pareto_front(study, target_names=list(map(title_of, objectives)))
-        yield _titled("Trials that no other is better than", figure.update_layout(height=HEIGHT_PX))
+        said = "Red: trials that no other is better than. Blue: the other trials that have run to their end."
+        yield _titled("Pareto front", figure.update_layout(height=HEIGHT_PX), said)
     for number, (objective, direction) in enumerate(zip(objectives, study.directions, strict=True)):
         title = html.escape(title_of(objective))
         better = "Higher" if direction == StudyDirection.MAXIMIZE else "Lower"
@@ -67,10 +68,10 @@ def charts_of(
         keys = list(dict.fromkeys(key for trial in complete for key in trial.params))
         drawn = "".join(chart(_slice(complete, key, number, objective)) for key in keys)
         yield f'<h2>Slices of the space: {title}</h2><div class="charts">{drawn}</div>'
-        figure = plot_parallel_coordinate(study, target=_value(number), target_name=title_of(objective))
-        # Optuna's own scale ends in white, which hides the worst trials.
-        figure.update_traces(line_colorscale="Viridis")
-        yield f"<h2>Parallel coordinates: {title}</h2>{chart(figure.update_layout(height=HEIGHT_PX), is_wide=True)}"
+        figure = plot_parallel_coordinate(_alone(complete, number, direction), target_name=title_of(objective))
+        # The scale ends in white.
+        figure.update_layout(height=HEIGHT_PX, plot_bgcolor="#d0d0d0")
+        yield f"<h2>Parallel coordinates: {title}</h2><p>Darker is better.</p>{chart(figure, is_wide=True)}"
 
 
 def _on_importance(n_trials: int) -> str:
@@ -79,6 +80,16 @@ def _on_importance(n_trials: int) -> str:
         "keys. A key that only tells bad trials from worse ones gets little."
     )
     return said + (f" {counted(n_trials, 'trial')} say little: some fifty are required." if n_trials < ENOUGH else "")
+
+
+def _alone(trials: Sequence[FrozenTrial], number: int, direction: StudyDirection) -> optuna.Study:
+    """Return a study with one of the objectives: of a target function, Optuna does not know the direction."""
+    study = optuna.create_study(direction=direction)
+    study.add_trials(
+        optuna.create_trial(value=trial.values[number], params=trial.params, distributions=trial.distributions)
+        for trial in trials
+    )
+    return study
 
 
 def _titled(heading: str, figure: Figure, said: str = "") -> str:

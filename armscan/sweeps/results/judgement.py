@@ -167,8 +167,8 @@ class Judgement:
             return "The default configuration was chosen, because trainings of all other candidates have failed."
         if self.chosen == CONTROL:
             return (
-                "No setting beat the default configuration: of all candidates, the control was the best on the "
-                "validation volumes."
+                "No setting beat the default configuration: on the validation volumes, no candidate's interval has a "
+                "better pessimistic end than the control's."
             )
         name = name_of(self.chosen).capitalize()
         if not self.differences and self.n_unjudged:

@@ -184,7 +184,8 @@ def _judgement(judgement: Judgement) -> str:
     said = f"<p><strong>{html.escape(judgement.result)}</strong></p>{notes}"
     if not judgement.differences:
         return said
-    seeds = f"Both were trained with the same {counted(judgement.n_seeds, 'seed')}, which nothing before has used."
+    n_seeds = counted(judgement.n_seeds, "seed")
+    seeds = f"Both were trained with the same {n_seeds}, which neither search nor selection has used."
     return f"{said}{table([each.row() for each in judgement.differences])}<p>{HOW} {seeds}</p>"
 
 

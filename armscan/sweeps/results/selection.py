@@ -148,7 +148,11 @@ def decision_section(
         f"has not used, compared by {html.escape(title_of(objective))} ({better} is better). Each "
         f"candidate got {n_seeds}. "
         f"{further if settings.min_seeds < settings.mean_seeds else ''}"
-        "The candidate whose interval has the best pessimistic end is chosen.",
+        + (
+            "The candidate whose interval has the best pessimistic end is chosen."
+            if settings.mean_seeds > 1
+            else "The candidate with the best score is chosen: one seed gives no interval."
+        ),
     ]
     if judgement is not None:
         judged = "the control alone" if judgement.chosen == CONTROL else f"{name_of(judgement.chosen)} and the control"

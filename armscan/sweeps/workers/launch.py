@@ -140,7 +140,7 @@ def _launch_elsewhere(monitor: StudyMonitor, folder: Path, launcher: str, launch
 @contextlib.contextmanager
 def _leaving(opened: OpenedStudy, folder: Path, tracked: TrackedRun, leave_s: float) -> Iterator[None]:
     """Return a context to launch the workers in, which leaves no worker and no open run behind."""
-    status, is_asked = "FINISHED", False
+    status, reason, is_asked = "FINISHED", None, False
 
     def ask(*_: object) -> None:
         """Ask the workers to leave before an interrupted launcher may kill them; as a handler, take no lock."""
@@ -171,6 +171,7 @@ def _leaving(opened: OpenedStudy, folder: Path, tracked: TrackedRun, leave_s: fl
             for phase in opened.phases:
                 for trial in phase.scheduler.reclaim(LivenessCheck().is_dead):
                     phase.close_runs_of(trial)
+                reason = reason or phase.scheduler.failure_reason(phase.scheduler.state())
             judgement = judge(opened.final_eval) if opened.final_eval is not None else None
             has_changed = judgement is not None and bool(judgement.others)
             metrics = best_metrics(opened.search.scheduler.study, judgement)
@@ -179,16 +180,18 @@ def _leaving(opened: OpenedStudy, folder: Path, tracked: TrackedRun, leave_s: fl
                 tracked.set_description(note)
                 where = opened.search.client, opened.search.experiment_id, opened.search.run_id, opened.folder
                 note_run(opened.search.scheduler.study, *where, note)
-        _upload(opened, tracked, "KILLED" if is_asked else status)
+        if reason is not None and status == "FINISHED":
+            status = "FAILED"
+        _upload(opened, tracked, "KILLED" if is_asked else status, reason)
         for each, handler in before.items():
             signal.signal(each, handler)
     if is_asked:
         raise KeyboardInterrupt
 
 
-def _upload(opened: OpenedStudy, tracked: TrackedRun, status: str) -> None:
+def _upload(opened: OpenedStudy, tracked: TrackedRun, status: str, reason: str | None) -> None:
     """End the study's own run, and upload what its trials buffered while their store was unavailable."""
-    is_there = tracked.end(status, wait_s=SHORT_WAIT_S if status == "KILLED" else None)
+    is_there = tracked.end(status, reason=reason, wait_s=SHORT_WAIT_S if status == "KILLED" else None)
     left = []
     if is_there:
         # Trusted: anyone who may write into the folder of a study can execute code in it anyway.

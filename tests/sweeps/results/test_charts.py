@@ -29,7 +29,7 @@ def test_front_is_drawn_of_two_or_three_objectives(n_objectives, n_fronts):
     study.tell(study.ask(), [1.0] * n_objectives)
     names = ["mean_steps", "mean_return", "success_rate", "training_s"][:n_objectives]
     shown = "".join(charts_of(study, study.trials, names, []))
-    assert shown.count("Trials that no other is better than") == n_fronts
+    assert shown.count("<h2>Pareto front</h2>") == n_fronts
 
 
 def test_names_of_objectives_in_a_storage_are_escaped():

@@ -113,7 +113,7 @@ def test_report_of_several_objectives_or_of_nothing_yet_can_be_made(answer, tmp_
     searched(tmp_path, objectives, n_trials)
     assert answer("--study=a", "--out=here")[0] == 0
     page = (tmp_path / "here" / "report.html").read_text()
-    assert ("Trials that no other is better than" if n_trials else "No trial has run to its end yet") in page
+    assert ("Pareto front" if n_trials else "No trial has run to its end yet") in page
     of_each = ["History", "Importance of each key", "Parallel coordinates", "Slices of the space"]
     titles = {"mean_steps": "steps, mean", "env_steps": "environment steps"}
     headings = [f"<h2>{what}: {titles[name]}</h2>" for what in of_each for name in objectives]
