@@ -117,12 +117,12 @@ class ClusterObservation:
 
     Args:
         normalised: Whether to return the normalised form; False: the raw one. Default: True.
-        targets: Numbers that the counts are divided by. Default: (4, 3, 1).
+        targets: Divisors of the counts. Default: None, (4, 3, 1).
     """
 
-    def __init__(self, *, normalised: bool = True, targets: Sequence[int] = PUBLISHED_TARGETS) -> None:
+    def __init__(self, *, normalised: bool = True, targets: Sequence[int] | None = None) -> None:
         self.normalised = check_bool("normalised", normalised)
-        self._targets = check_targets(targets)
+        self._targets = check_targets(PUBLISHED_TARGETS if targets is None else targets)
         self._scales: dict[SliceGeometry, tuple[FloatArray, FloatArray]] = {}
 
     def spaces(self, geometries: Sequence[SliceGeometry], n_action: int) -> dict[str, spaces.Box]:

@@ -57,8 +57,11 @@ def test_conf_composes_every_agent_and_experiment(override):
 
 
 def test_cluster_observation_takes_a_reward_without_targets():
-    assert compose(["~reward.targets"]).obs.targets == [4, 3, 1]
     assert compose(["reward.targets=[1,2,3]"]).obs.targets == [1, 2, 3]
+    config = compose(["~reward.targets"])
+    assert config.obs.targets is None
+    # Hydra resolves the whole section.
+    assert instantiate(config.env)
 
 
 @pytest.mark.parametrize("clustering", ["pixels", "metric"])
