@@ -132,7 +132,7 @@ def test_run_says_when_it_validates_where_the_agent_takes_more_steps_at_once_tha
     assert ended.returncode == 0, ended.stderr
     assert "validating every 256 environment steps, which the agent takes at once" in ended.stdout
     assert "training.eval_every_env_steps = 200" in ended.stdout
-    assert "512/400 steps" in ended.stdout
+    assert "512/512 steps" in ended.stdout
 
 
 @pytest.mark.full
