@@ -194,7 +194,7 @@ def test_run_killed_at_twenty_moments_ends_with_the_same_weights_and_figures(tmp
 @pytest.mark.slow
 def test_interrupted_run_says_how_to_go_on_and_only_one_process_may(tmp_path):
     process = start_run(*LONGER, "training.env_steps=5000", cwd=tmp_path)
-    wait_until(lambda: (tmp_path / "printed").read_text().count("/5000 steps") >= 2, process=process)
+    wait_until(lambda: (tmp_path / "printed").read_text().count(" steps  on plane") >= 2, process=process)
     (run,) = runs_in(tmp_path)[1]
     # Still running, and not finished before the other has started.
     process.send_signal(signal.SIGSTOP)
