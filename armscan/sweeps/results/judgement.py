@@ -166,10 +166,7 @@ class Judgement:
         if self.chosen == CONTROL and self.have_others_failed:
             return "The default configuration was chosen, because trainings of all other candidates have failed."
         if self.chosen == CONTROL:
-            return (
-                "No setting beat the default configuration: on the validation volumes, no candidate's interval has a "
-                "better pessimistic end than the control's."
-            )
+            return "No setting beat the default configuration in the selection, on the validation volumes."
         name = name_of(self.chosen).capitalize()
         if not self.differences and self.n_unjudged:
             return f"{name} was chosen; it has not been judged beside the control yet."
