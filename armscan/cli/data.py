@@ -215,8 +215,8 @@ def _coarse_note(volume: LabelVolume) -> list[str]:
         return []
     (usual_across, usual_depth), (across, depth) = USUAL_PIXEL_MM, volume.pixel_mm
     return [
-        f"pixels of {across:.3g} x {depth:.3g} mm are coarse: clusters merge, so planes that look alike differ by many "
-        f"degrees; spacing: [{usual_across}, {usual_across}, {usual_depth}] in the manifest resamples the volumes"
+        f"pixels of {across:.3g} x {depth:.3g} mm are coarse: clusters merge, so planes many degrees apart get the "
+        f"same score; spacing: [{usual_across}, {usual_across}, {usual_depth}] in the manifest resamples the volumes"
     ]
 
 

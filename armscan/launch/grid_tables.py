@@ -47,7 +47,11 @@ def keep_tables(
     from mlflow.exceptions import MlflowException
 
     try:
-        if not _pool_folds(table, folder, parent, outcomes, runs, store):
+        if (pooled := _pooled_folds(parent, outcomes, runs)) is not None:
+            of_folds, notes = pooled
+            print_result_table(f"{next(iter(of_folds.results)).split(', ')[1]} (test)", of_folds, notes)
+            keep_folds_table(of_folds, table, folder, store, parent["run_id"], notes)
+        else:
             n_jobs = counted(sum(map(bool, table.facts["outcome"])), "job")
             body = f"<p><code>{html.escape(' '.join(parent['overrides']))}</code></p>{table.html()}"
             _keep_page(folder, page(f"Grid of {n_jobs}", body), table.markdown(), store, parent["run_id"])
@@ -99,17 +103,12 @@ def _keep_page(folder: Path, text: str, description: str, store: TrackingStore, 
     set_description(store, run_id, description)
 
 
-def _pool_folds(
-    jobs: ResultTable,
-    folder: Path,
-    parent: Mapping[str, Any],
-    outcomes: Mapping[str, JobOutcome],
-    runs: Sequence[Run],
-    store: TrackingStore,
-) -> bool:
-    """Print one table over all folds of a cross-validation, and save it above the table of the jobs; False without."""
+def _pooled_folds(
+    parent: Mapping[str, Any], outcomes: Mapping[str, JobOutcome], runs: Sequence[Run]
+) -> tuple[ResultTable, list[str]] | None:
+    """Return one table over all folds of a cross-validation, and notes on it; None of another grid."""
     if not any(word.startswith(f"{FOLD}=") for word in parent["overrides"]):
-        return False
+        return None
     planned = [dict(word.partition("=")[::2] for word in job) for job in jobs_of(parent["overrides"])[1]]
     finished = [run for run in runs if outcomes[run.data.tags[JOB_TAG]].failure is None]
     varied = {
@@ -119,11 +118,8 @@ def _pool_folds(
     tested = [(Path(run.data.tags[FOLDER_TAG]), varied[run.data.tags[JOB_TAG]]) for run in finished]
     table = folds_table(tested, len({job[FOLD] for job in planned}))
     if table is None:
-        return False
+        return None
     left_out = len(planned) - len(finished)
     missing = f"{left_out} of {len(planned)} jobs are missing: the table is over the folds that all seeds tested on"
-    title, of_agent = next(each for each in table.results.items() if each[0].startswith("agent, "))
-    notes = [*([missing] if left_out else []), *few_wrists({"test ": of_agent})]
-    print_result_table(f"{title.split(', ')[1]} (test)", table, notes)
-    keep_folds_table(table, jobs, folder, store, parent["run_id"], notes)
-    return True
+    of_agent = next(each for title, each in table.results.items() if title.startswith("agent, "))
+    return table, [*([missing] if left_out else []), *few_wrists({"test ": of_agent})]
