@@ -223,25 +223,27 @@ def judge(final: FinalEvaluation) -> Judgement | None:
 
 
 def best_metrics(search: optuna.Study, judgement: Judgement | None) -> dict[str, float]:
-    """Return the leading metrics of a study's best trial and of its result, by the names that runs use.
+    """Return the leading metrics of a study's result, by the names that runs use; before it has one, of its best trial.
 
-    If the study went on after its end, differences that only an earlier result had are NaN: MLflow cannot delete them.
+    Metrics that an earlier call may have returned and that are not valid any more are NaN: MLflow cannot delete them.
+    The control has no validation metrics, and a study that went on after its end lacks differences of the earlier one.
 
     Args:
         search: Study of the search.
         judgement: Its judgement; None without one.
     """
-    found: dict[str, float] = {}
-    if best := best_trials(search, 1):
-        metrics = best[0].user_attrs.get(METRICS, {})
-        found |= {f"validation/{name}": metrics[name] for name in leading_among(metrics)}
+    best = best_trials(search, 1)
+    found = _leading("validation", best[0].user_attrs.get(METRICS, {}) if best else {})
     if judgement is None or (chosen := judgement.of_chosen) is None:
         return found
+    found = dict.fromkeys(found, math.nan)
+    if judgement.chosen != CONTROL:
+        trials = search.get_trials(deepcopy=False)
+        found |= _leading("validation", trials[judgement.chosen].user_attrs.get(METRICS, {}))
     of_chosen = chosen.figures.metrics()
-    found |= {f"{TEST_METRICS}/{name}": of_chosen[name] for name in leading_among(of_chosen)}
+    found |= _leading(TEST_METRICS, of_chosen)
     if (of_random := chosen.baselines.get(RANDOM)) is not None:
-        metrics = of_random.metrics()
-        found |= {f"{RANDOM}/{name}": metrics[name] for name in leading_among(metrics)}
+        found |= _leading(RANDOM, of_random.metrics())
     if judgement.others:
         compared = (*(name for name in search.user_attrs[OBJECTIVES] if name in of_chosen), *leading_among(of_chosen))
         found |= dict.fromkeys(
@@ -249,8 +251,17 @@ def best_metrics(search: optuna.Study, judgement: Judgement | None) -> dict[str,
         )
     for each in judgement.differences:
         for key, estimate in zip(COMPARISONS, (each.paired, each.probability), strict=True):
-            found |= dict(zip(_names(key, each.metric), estimate, strict=True))
+            found |= {
+                name: value
+                for name, value in zip(_names(key, each.metric), estimate, strict=True)
+                if not math.isnan(value)
+            }
     return found
+
+
+def _leading(prefix: str, metrics: Mapping[str, float]) -> dict[str, float]:
+    """Return the leading metrics that are not NaN, by their names in MLflow."""
+    return {f"{prefix}/{name}": metrics[name] for name in leading_among(metrics) if not math.isnan(metrics[name])}
 
 
 def _names(key: str, metric: str) -> list[str]:

@@ -173,9 +173,8 @@ def _leaving(opened: OpenedStudy, folder: Path, tracked: TrackedRun, leave_s: fl
                     phase.close_runs_of(trial)
                 reason = reason or phase.scheduler.failure_reason(phase.scheduler.state())
             judgement = judge(opened.final_eval) if opened.final_eval is not None else None
-            has_changed = judgement is not None and bool(judgement.others)
             metrics = best_metrics(opened.search.scheduler.study, judgement)
-            tracked.log_metrics(metrics, n_env_steps=0, keeps_nan=has_changed)
+            tracked.log_metrics(metrics, n_env_steps=0, keeps_nan=True)
             if note := result_note(judgement):
                 tracked.set_description(note)
                 where = opened.search.client, opened.search.experiment_id, opened.search.run_id, opened.folder

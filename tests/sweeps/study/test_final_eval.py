@@ -312,20 +312,23 @@ def test_run_of_a_study_that_goes_on_until_the_control_wins_keeps_no_difference(
     for number in range(asked.final_eval.top_k):
         trial = search.ask()
         trial.suggest_float("agent.lr", 1e-4, 1e-2)
+        trial.set_user_attr(METRICS, {"mean_steps": 0.5, "success_rate": 0.5})
         search.tell(trial, 0.5 + 0.01 * number)
     worse = dict.fromkeys(range(3, 3 + asked.final_eval.top_k), 9.0)
     judged = judge(run(storage_uri, true=TRUE | worse))
     assert (judged.chosen, judged.others) == (CONTROL, (1,))
     after = best_metrics(search, judged)
-    compared = [name for name in before if name.startswith(COMPARISONS)]
-    assert "difference/mean_steps_low" in compared
-    assert all(math.isnan(after[name]) for name in compared)
+    invalid = [name for name in before if name.startswith((*COMPARISONS, "validation/"))]
+    assert {"difference/mean_steps_low", "validation/mean_steps"} <= {*invalid}
+    assert all(math.isnan(after[name]) for name in invalid)
 
 
 def test_run_of_the_study_has_the_result(storage_uri):
     final = run(storage_uri)
-    metrics = best_metrics(final.search, judge(final))
-    assert metrics["validation/mean_steps"] == 1.0
+    judged = judge(final)
+    metrics = best_metrics(final.search, judged)
+    assert best_metrics(final.search, None) == {"validation/mean_steps": 1.0, "validation/success_rate": 0.5}
+    assert metrics["validation/mean_steps"] == final.search.trials[judged.chosen].user_attrs[METRICS]["mean_steps"] > 1
     assert metrics["difference/mean_steps_low"] < metrics["difference/mean_steps"] < 0
     assert metrics["probability_of_improvement/mean_steps"] == 1.0
     assert metrics["test_volumes/mean_steps"] < 4.0
