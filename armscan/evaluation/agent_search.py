@@ -13,8 +13,9 @@ from armscan.envs.actions import COMPONENTS, free_components
 from armscan.envs.rules import ON_BUDGET, ON_REWARD
 from armscan.errors import InvalidValueError, OptimalPlaneError
 from armscan.evaluation.agent_source import EvaluatedAgent
-from armscan.evaluation.runner import FIRST_SEED, prepare_on_volumes
+from armscan.evaluation.runner import prepare_on_volumes
 from armscan.evaluation.volumes import own_split
+from armscan.training.episode_seeds import EVALUATION_SEED
 from armscan.utils.console import print_sentence
 from armscan.volumes import LabelVolume, ManipulatorAction
 
@@ -66,8 +67,8 @@ class AgentSearch:
         for note in prepared.notes:
             print_sentence(f"note: {note}")
         agent, env = prepared.agent, prepared.envs[volume.name]
-        observation, info = env.reset(seed=FIRST_SEED)
-        agent.begin(seed=FIRST_SEED, bounds=env.get_wrapper_attr("episode").scene.bounds)
+        observation, info = env.reset(seed=EVALUATION_SEED)
+        agent.begin(seed=EVALUATION_SEED, bounds=env.get_wrapper_attr("episode").scene.bounds)
         reward, ended = float(info["reward"]), False
         while not ended:
             observation, received, terminated, truncated, _ = env.step(agent.act(observation, reward))

@@ -28,10 +28,9 @@ from armscan.tracking import FoundRun
 from armscan.training import PARTS, Evaluation, Split, TrainingDomain, evaluate, evaluate_baselines
 from armscan.training.domain import smallest_slice
 from armscan.training.episode_results import Env
+from armscan.training.episode_seeds import EVALUATION_SEED
 from armscan.utils.console import print_sentence
 
-# First seed of an evaluation's episodes, above the seeds of a run's own evaluations.
-FIRST_SEED = 5 * 10**6
 PIXEL_TOLERANCE = 0.1
 
 
@@ -76,7 +75,7 @@ class PreparedAgent:
         on_plane = on_plane_of(self.source.config)
         for label, env in self.envs.items():
             tell(f"playing {n_episodes} episodes on {len(env.get_wrapper_attr('volumes'))} {label}")
-            how = {"n_episodes": n_episodes, "seed": FIRST_SEED + seed}
+            how = {"n_episodes": n_episodes, "seed": EVALUATION_SEED + seed}
             evaluations[label] = evaluate(self.agent, env, **how, on_plane=on_plane)
             for name, evaluation in evaluate_baselines(env, **how, on_plane=on_plane).items():
                 baselines.setdefault(name, {})[label] = evaluation

@@ -7,9 +7,10 @@ import tempfile
 from functools import partial
 from pathlib import Path
 
-from armscan.evaluation.runner import FIRST_SEED, PreparedAgent
+from armscan.evaluation.runner import PreparedAgent
 from armscan.evaluation.volumes import check_out, data_name, file_name
 from armscan.training import TEST, VideoRecorder, outcome
+from armscan.training.episode_seeds import EVALUATION_SEED
 from armscan.utils.files import atomic_write
 from armscan.utils.run_files import ID_CHARS
 
@@ -53,6 +54,6 @@ def _record(prepared: PreparedAgent, n_episodes: int, seed: int, gif: Path, mp4:
             for number in range(n_episodes):
                 volume, title = names[number % len(names)], f"seed {seed + number}"
                 episode = video.capture(
-                    prepared.agent, env, volume_name=volume, seed=FIRST_SEED + seed + number, title=title
+                    prepared.agent, env, volume_name=volume, seed=EVALUATION_SEED + seed + number, title=title
                 )
                 print(f"{label}: {volume}, {title}: {outcome(episode)}", flush=True)

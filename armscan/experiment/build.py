@@ -50,7 +50,7 @@ class Experiment:
         budget: Budget of the training.
         n_episodes: Number of episodes of each final evaluation.
         on_plane: Limits within which a plane counts as the labelled one.
-        seed: Seed of all random numbers.
+        seed: Seed of the environments, networks and replay buffer; those of evaluations are derived from it.
         smallest_slice_px: Largest shape (across, depth) in pixels that fits into all slices; images of every
             split are cropped to it by default.
         needs_trust: Whether its configuration names classes that are not armscan's.

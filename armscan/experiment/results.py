@@ -24,14 +24,13 @@ from armscan.training import (
 )
 from armscan.training.baselines import RANDOM
 from armscan.training.episode_results import TEST_METRICS, metric_prefix
+from armscan.training.episode_seeds import TEST_VOLUMES_SEED, TRAINING_VOLUMES_SEED
 from armscan.training.headline import ABOVE_RANDOM, MIN_WRISTS, beside_random, headline
 from armscan.training.metric_display import LEADING
 from armscan.utils.files import atomic_write
 from armscan.utils.run_files import BASELINES_FILE, EVALUATION_FILE, RESULTS_PAGE
 from armscan.utils.text import PERCENT, counted, formatted
 
-# First seeds of the final evaluations' episodes; those of the baselines do not depend on the seed of the run.
-TRAINING_VOLUMES_SEED, TEST_VOLUMES_SEED = 2 * 10**6, 3 * 10**6
 LAST_VALIDATION = "last validation"
 AGENT = "agent"
 TITLES = {

@@ -29,6 +29,7 @@ from armscan.training import (
     record_episode,
     train,
 )
+from armscan.training.episode_seeds import VALIDATION_SEED, VIDEO_SEED
 from armscan.training.progress import progress_reporter
 from armscan.utils.compilation import log_compilation
 from armscan.utils.console import print_sentence
@@ -44,10 +45,8 @@ from armscan.utils.run_files import (
 )
 from armscan.utils.text import counted
 
-# First seeds of the episodes for each purpose, so that no episode serves two; see also `results`.
-VALIDATION_SEED, VIDEO_SEED = 10**6, 4 * 10**6
 OF_ENVIRONMENT = ("armscan.volumes", "armscan.anatomy", "armscan.envs")
-COMPILING = "compiling the environment for this machine, which takes half a minute; later runs find it in the cache"
+COMPILING = "compiling the environment for this machine, which takes up to a minute; later runs find it in the cache"
 
 
 def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict[str, float]]:

@@ -14,8 +14,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from armscan.stats.bootstrap import Estimate, difference_of_rates, wilson
+from armscan.stats.bootstrap import Estimate
 from armscan.stats.paired import crossed_mean, of_subjects, weighted_by_volume
+from armscan.stats.proportions import difference_of_rates, wilson
 from armscan.training.episode_results import Evaluation, subject_of_volumes
 from armscan.training.metric_display import interval_text
 from armscan.training.metrics import MetricEstimates

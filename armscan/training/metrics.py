@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from armscan.stats.bootstrap import UNKNOWN, Estimate, Statistic, estimates, interquartile_mean, mean, quantile, wilson
+from armscan.stats.bootstrap import UNKNOWN, Estimate, Statistic, estimates, interquartile_mean, mean, quantile
 from armscan.stats.on_plane import OnPlane, limits_among
+from armscan.stats.proportions import wilson
 from armscan.training.episode_results import MEANS, EpisodeResult, Evaluation
 
 # Suffix of metrics over the episodes that did not start solved, and of rates with Wilson's interval.

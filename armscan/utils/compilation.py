@@ -27,7 +27,7 @@ EVENTS: Any = numba.core.event
 
 
 def cached_njit(**options: Any) -> Callable[[Function], Function]:
-    """Return `numba.njit` with a cache that is invalidated if any compiled function of armscan has changed.
+    """Return `numba.njit` with a cache that is invalidated if any file with compiled functions has changed.
 
     Numba itself checks only the file of a function, not those of the compiled functions that it calls, and would keep
     their old code.

@@ -22,11 +22,12 @@ from omegaconf import OmegaConf
 
 from armscan.config.defaults import PHANTOM, default_tracking
 from armscan.evaluation.agent_source import agent_of_run
-from armscan.evaluation.runner import FIRST_SEED, prepare_agent
+from armscan.evaluation.runner import prepare_agent
 from armscan.tracking import find_run, open_existing_store
 from armscan.tracking.tags import AGENT_TAG
 from armscan.training import TEST, evaluate
 from armscan.training.episode_results import EpisodeResult
+from armscan.training.episode_seeds import EVALUATION_SEED
 from benchmarks.tables import print_head, print_row
 
 N_PHANTOMS, N_GROUPS = 12, 10
@@ -52,7 +53,7 @@ def played(
     prepared = prepare_agent(subject, data, N_PHANTOMS)
     label = data if data == PHANTOM else TEST
     env = prepared.envs.get(label, list(prepared.envs.values())[-1])
-    return list(evaluate(prepared.agent, env, n_episodes=n_episodes, seed=FIRST_SEED).episodes)
+    return list(evaluate(prepared.agent, env, n_episodes=n_episodes, seed=EVALUATION_SEED).episodes)
 
 
 def print_errors(name: str, episodes: Sequence[EpisodeResult]) -> None:

@@ -8,7 +8,8 @@ import pytest
 from armscan.errors import InvalidValueError, OptimalPlaneError
 from armscan.evaluation import agent_of_run
 from armscan.evaluation.agent_search import AgentSearch
-from armscan.evaluation.runner import FIRST_SEED, prepare_on_volumes
+from armscan.evaluation.runner import prepare_on_volumes
+from armscan.training.episode_seeds import EVALUATION_SEED
 from armscan.training.episodes import play
 from armscan.volumes import LabelVolume
 from tests.support.tracked_runs import tracked
@@ -33,7 +34,7 @@ def test_agent_finds_the_plane_of_its_episode_without_knowing_the_labelled_one(d
     found = AgentSearch(source)(unlabelled)
     source.config.env.transform = None
     env = prepare_on_volumes(source, {"volumes": {volume.name: volume}}, own=pytest.fail)
-    result = play(env.agent, env.envs["volumes"], volume.name, FIRST_SEED)
+    result = play(env.agent, env.envs["volumes"], volume.name, EVALUATION_SEED)
     assert found.action == env.envs["volumes"].get_wrapper_attr("episode").plane
     assert found.score == result.final_reward
 

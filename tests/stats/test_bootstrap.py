@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from armscan.errors import InvalidValueError
-from armscan.stats.bootstrap import estimates, interquartile_mean, mean, quantile, wilson
+from armscan.stats.bootstrap import estimates, interquartile_mean, mean, quantile
 
 
 @pytest.mark.parametrize("share", [0.0, 0.25, 0.5, 0.95, 1.0])
@@ -84,14 +84,6 @@ def test_intervals_hold_the_truth_about_as_often_as_they_say():
     # With eight volumes a bootstrap is somewhat too narrow; one that takes episodes as independent is far too narrow.
     assert n_by_volume >= 175
     assert n_as_one <= 160
-
-
-def test_wilson_is_that_of_scipy_and_has_a_width_at_the_ends():
-    for n_successes in (0, 13, 200):
-        theirs = stats.binomtest(n_successes, 200).proportion_ci(method="wilson")
-        assert wilson(n_successes, 200)[1:] == pytest.approx((theirs.low, theirs.high))
-    assert wilson(200, 200).low == pytest.approx(0.9812, abs=1e-4)
-    assert all(map(math.isnan, wilson(0, 0)))
 
 
 @pytest.mark.parametrize("volumes", [[], ["a"]])

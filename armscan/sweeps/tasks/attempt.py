@@ -1,4 +1,4 @@
-"""Tasks of trials, and an attempt at one: its values, reports, tracked run and folder."""
+"""Tasks of trials, and an attempt at one: its configuration, reports, MLflow run and folder."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ from armscan.experiment.build import (
 from armscan.experiment.job import Invocation, Job
 from armscan.experiment.provenance import place_tags, start_tracking, volume_tags
 from armscan.experiment.results import RunResult
-from armscan.experiment.runner import VIDEO_SEED, log_result, train_agent
+from armscan.experiment.runner import log_result, train_agent
 from armscan.sweeps.scheduling.limits import LimitReachedError
 from armscan.sweeps.scheduling.state import TEST_PREFIX
 from armscan.sweeps.tasks.attempt import Attempt, over_seeds, volumes_of
@@ -45,6 +45,7 @@ from armscan.training import (
     record_episode,
     resume_from_checkpoint,
 )
+from armscan.training.episode_seeds import SELECTION_SEED, VIDEO_SEED
 from armscan.utils.files import atomic_write
 from armscan.utils.log import log
 from armscan.utils.retry import RETRY_S
@@ -53,8 +54,6 @@ from armscan.utils.run_files import LAST_CHECKPOINT, LEARNING_CURVE_FILE, RUN_FI
 if TYPE_CHECKING:
     from mlflow.entities import Run
 
-# First seed of the episodes by which candidates are compared, which are used for nothing else.
-SELECTION_SEED = 7 * 10**6
 Conclude = Callable[[Experiment, TrainingResult, TrackedRun, Path], dict[str, float]]
 
 

@@ -110,12 +110,11 @@ def train_and_evaluate(
     """
     from armscan.config.compose import compose_run
     from armscan.experiment.build import build_experiment
-    from armscan.experiment.results import TEST_VOLUMES_SEED
     from armscan.experiment.runner import train_agent
     from armscan.sweeps.space.parameter import overrides_of
     from armscan.sweeps.tasks.attempt import volumes_of
-    from armscan.sweeps.tasks.training import SELECTION_SEED
     from armscan.training import evaluate
+    from armscan.training.episode_seeds import SELECTION_SEED, TEST_VOLUMES_SEED
     from armscan.utils.log import silence_libraries
 
     silence_libraries()
