@@ -87,7 +87,7 @@ class ResumeError(ArmscanError, RuntimeError):
 
 
 class UntrustedError(ArmscanError, RuntimeError):
-    """Acting on a stored value, which a stranger may have written, is unsafe."""
+    """Acting on a stored value, which anybody may have written, is unsafe."""
 
 
 class DisplayError(ArmscanError, RuntimeError):

@@ -29,39 +29,41 @@ class FinderParameters:
         "loss_mm",
         "loss_deg",
         "loss_across_mm",
-        "astray_share",
+        "perturbed_share",
         "phantom_share",
     )
     """See `Parameters.SCHEDULABLE`."""
 
     offsets_mm: Sequence[float] = (9.0, -9.0, 0.0)
-    """Offset of the next look along the normal from the plane found so far, in mm, after each look, the start included.
-    The last is 0: the answer.
+    """Offset of the next look along the normal from the plane found so far, in mm, after each look and at the start:
+    2 to 20 numbers from -100 to 100. The last is 0: the answer.
     """
 
     n_seen: int = 3
-    """Number of latest looks that the network sees; at most the number of looks."""
+    """Number of latest looks that the network sees, from 1 to the number of looks."""
 
     n_averaged: int = 1
-    """Number of latest looks whose estimates are averaged, weighted by the inverse squares of their expected errors; at
-    most the number of looks. The next look is placed beside their mean; the answer is the mean. 1: the latest estimate
-    alone, with which the network is always trained.
+    """Number of latest looks whose estimates are averaged, weighted by the inverse squares of their expected errors;
+    from 1 to the number of looks. The next look is placed beside their mean; the answer is the mean. 1: the latest
+    estimate alone, with which the network is always trained.
     """
 
     average_tilts: bool = True
     """Whether to average tilts too. False: only distances; the tilt is the latest look's."""
 
     filters: Sequence[int] = (12, 24, 36)
-    """Filters of each of the three convolutions."""
+    """Filters of each of the three convolutions, each from 1 to 4096."""
 
     hidden_sizes: Sequence[int] = (128, 128)
-    """Units of each layer after the convolutions."""
+    """Units of each layer after the convolutions, each from 1 to 4096."""
 
     sure_mm: float | None = None
-    """Largest expected error in mm at which, with `sure_deg`, the agent stops looking. None: it takes all looks."""
+    """Largest expected error in mm, above 0, at which, with `sure_deg`, the agent stops looking. None: it takes all
+    looks.
+    """
 
     sure_deg: float | None = None
-    """Expected error in degrees; see `sure_mm`. Give both or none."""
+    """Expected error in degrees, above 0; see `sure_mm`. Give both or none."""
 
     lr: float = number(1.5e-3, above=0.0, at_most=1.0)
     """Learning rate of Adam."""
@@ -81,11 +83,12 @@ class FinderParameters:
     loss_across_mm: float = number(6.0, above=0.0, at_most=100.0)
     """Error of the slice's middle across, in mm, above which the smooth L1 loss is linear."""
 
-    astray_share: float = number(0.3, at_least=0.0, at_most=1.0)
+    perturbed_share: float = number(0.3, at_least=0.0, at_most=1.0)
     """Share of the training looks that are perturbed at random, by some mm and degrees."""
 
     phantom_share: float | None = None
-    """Share of the training episodes on phantoms, if there are other volumes too. None: all volumes are equally likely.
+    """Share of the training episodes on phantoms, from 0 to 1, if there are other volumes too. None: all volumes are
+    equally likely.
     """
 
     def __post_init__(self) -> None:

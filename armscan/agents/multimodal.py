@@ -56,7 +56,7 @@ class Multimodal:
         images = images_of(observation_space)
         if not images:
             raise InvalidValueError(
-                "network is multimodal, which takes images, but the observation has none; take network=mlp, or an "
+                "network is multimodal, which takes images, but the observation has none; set network=mlp, or an "
                 "observation with images, such as obs=slice, and env.flat=null or false"
             )
         smallest = smallest_side_px()

@@ -73,7 +73,7 @@ class MLP:
             raise InvalidValueError(
                 "network is mlp, which takes one vector, but the observation has the parts "
                 f"{', '.join(observation_space) if isinstance(observation_space, spaces.Dict) else observation_space}; "
-                "take network=multimodal, or obs=cluster, or env.flat=true to put images and all into one vector"
+                "set network=multimodal, or obs=cluster, or env.flat=true to put images and all into one vector"
             )
         check_weights(self, linear_weights([*(observation_space.shape or ()), *self.hidden_sizes]))
         return self

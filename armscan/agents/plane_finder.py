@@ -62,8 +62,8 @@ class PlaneFinder(FinderParameters):
         n_at_once = self.num_envs * self.n_looks
         if n_at_once > setup.total_env_steps:
             raise InvalidValueError(
-                f"agent.num_envs is {self.num_envs}, which look {n_at_once} times before the first gradient step, but "
-                f"training.env_steps is {setup.total_env_steps}"
+                f"agent.num_envs is {self.num_envs}, so the first gradient step takes {n_at_once} environment steps "
+                f"({self.n_looks} looks in each), but training.env_steps is {setup.total_env_steps}"
             )
 
 

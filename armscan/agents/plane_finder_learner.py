@@ -28,7 +28,7 @@ from armscan.utils.arrays import FloatArray
 # Names of phantoms; those of files have an extension.
 PHANTOM = re.compile(r"phantom-[\w-]+")
 # Perturbed looks: range of the standard deviations, in mm and degrees, which are drawn log-uniformly.
-ASTRAY_MM, ASTRAY_DEG = (0.5, 6.0), (1.0, 8.0)
+PERTURBED_MM, PERTURBED_DEG = (0.5, 6.0), (1.0, 8.0)
 # Factors on the loss thresholds for the first look: two tilts, distance along the normal, position across.
 FIRST_LOOK = (2.0, 2.0, 5.0, 1.0)
 # Weight of the second head's loss relative to the first's.
@@ -121,14 +121,14 @@ class PlaneFinderLearner(SupervisedLearner):
         """Return the next looks beside the planes found so far, some of them perturbed, as actions that never stop."""
         n = self._envs.num_envs
         draws = torch.as_tensor(rng.normal(size=(n, 4)), dtype=torch.float32, device=self._device)
-        spreads = np.exp([rng.uniform(math.log(low), math.log(high), n) for low, high in (ASTRAY_DEG, ASTRAY_MM)])
-        is_astray = rng.random(n) < self._finder.astray_share
-        astray_deg, astray_mm = torch.as_tensor(spreads * is_astray, dtype=torch.float32, device=self._device)
+        spreads = np.exp([rng.uniform(math.log(low), math.log(high), n) for low, high in (PERTURBED_DEG, PERTURBED_MM)])
+        is_perturbed = rng.random(n) < self._finder.perturbed_share
+        perturbed_deg, perturbed_mm = torch.as_tensor(spreads * is_perturbed, dtype=torch.float32, device=self._device)
         with torch.no_grad():
             plane, place, *_ = self._module.estimate(seen)
-            tilt = torch.deg2rad(astray_deg)[:, None] * draws[:, :2]
+            tilt = torch.deg2rad(perturbed_deg)[:, None] * draws[:, :2]
             place = torch.cat([place[:, :2] + tilt, place[:, 2:]], dim=1)
-            beside_mm = offset_mm + astray_mm * draws[:, 2]
+            beside_mm = offset_mm + perturbed_mm * draws[:, 2]
             geometry = self._module.geometry
             actions = geometry.actions(geometry.from_frame(plane, place, beside_mm)).cpu().numpy()
         if not np.isfinite(actions).all():

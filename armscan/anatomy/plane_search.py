@@ -136,10 +136,10 @@ def find_optimal_plane(
         volume: Volume to search, over its whole length.
         rz_deg: Largest rotation about Z to try, in degrees, in both directions, from 0 to 80. Default: 45.
         rx_deg: Largest rotation about X to try, in degrees, in both directions, from 0 to 80. Default: 20.
-        step_deg: Step between rotations in the first search, in degrees; half of it around the region with the best
-            score. Default: 5.
-        step_mm: Step along the arm in the first search, in mm; half of it around the region with the best score.
-            Default: 3.
+        step_deg: Step between rotations in the first search, in degrees, above 0; half of it around the region with the
+            best score. Default: 5.
+        step_mm: Step along the arm in the first search, in mm, above 0; half of it around the region with the best
+            score. Default: 3.
         success_threshold: Threshold of success: a plane counts as found if it scores above -success_threshold. Default:
             0.05.
         targets: Target counts of the reward. Default: (4, 3, 1).

@@ -42,7 +42,7 @@ class LandmarkReward:
     single artery in depth.
 
     Args:
-        targets: Target counts: clusters of bones, tendons and artery that the wanted plane shows; (7, 5, 1) in the
+        targets: Target counts: clusters of bones, tendons and artery on a labelled plane; (7, 5, 1) in the
             other published description. Default: (4, 3, 1).
 
     Raises:
@@ -203,7 +203,7 @@ def landmark_reward(clusters: TissueClusters, targets: Sequence[int] = PUBLISHED
 
     Args:
         clusters: Clusters in the slice.
-        targets: Target counts: clusters of bones, tendons and artery that the wanted plane shows.
+        targets: Target counts: clusters of bones, tendons and artery on a labelled plane.
 
     Raises:
         InvalidValueError: If `targets` is not three whole numbers from 1 to 1000, or `clusters` is not a

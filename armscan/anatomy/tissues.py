@@ -99,7 +99,7 @@ class MetricTissue:
             raise InvalidValueError(
                 f"eps_mm of label {self.label} is {self.eps_mm:g}, but with pixels of {across_mm:g} x {depth_mm:g} mm "
                 f"it must be at least {max(across_mm, depth_mm):g}: below, pixels have no neighbours along an axis; "
-                "take clustering=pixels, or a larger eps_mm"
+                "set clustering=pixels, or a larger eps_mm"
             )
         half_widths = disc_half_widths(ROUNDING * self.eps_mm, across_mm, depth_mm)
         return Neighbourhood(half_widths, math.ceil(self.density * count_disc_pixels(half_widths)))
@@ -121,7 +121,7 @@ PIXEL_TISSUES = Tissues(
 )
 
 # Finds what the pixel mode finds at its own spacing, and the same at any other with pixels of up to about 0.55 mm. In
-# larger ones than 0.6 mm, the artery's have no neighbours.
+# pixels above 0.6 mm, pixels of the artery have no neighbour within `eps_mm`.
 MAX_METRIC_PIXEL_MM = 0.6
 METRIC_TISSUES = Tissues(
     MetricTissue(label=1, eps_mm=1.6, density=0.94),

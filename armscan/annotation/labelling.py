@@ -40,8 +40,8 @@ class LabellingOptions:
     Args:
         data: Folder of the volumes.
         tissues: Clustering rule of each tissue.
-        volumes: File names of the volumes to label. None: all.
-        overwrite: Whether to label volumes that already have a plane.
+        volumes: File names of the volumes to label. Default: None, all.
+        overwrite: Whether to label volumes that already have a plane. Default: False.
         pictures: Folder for the pictures; created if it does not exist.
         markups: Whether to write a markups file for 3D Slicer beside each picture.
         markup: Markups file with the plane of `volume`, which replaces the search.

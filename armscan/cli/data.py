@@ -97,7 +97,9 @@ def label(
         raise click.UsageError("--markup and --volume must be given together: which file, and for which volume")
     if markup is not None and (volumes or overwrite or agent):
         idle = "--volumes" if volumes else "--overwrite" if overwrite else "--agent"
-        raise click.UsageError(f"{idle} is for a search, but --markup and --volume say which plane and for what")
+        raise click.UsageError(
+            f"{idle} cannot be combined with --markup and --volume, which read the plane of one volume from a file"
+        )
     if pictures is None and (folder / PICTURES).is_symlink():
         # Otherwise the author of the data folder would choose where pictures are written.
         raise InvalidValueError(f"{folder / PICTURES}: is a link: name the folder of the pictures with --pictures")

@@ -183,7 +183,7 @@ def _check_options(agent: str | None, data: str | None, tracking_experiment: str
     """Raise an error if options exclude each other, or the folder does not exist."""
     if is_given("phantoms") and data != "phantom":
         number = click.get_current_context().params["phantoms"]
-        raise click.UsageError(f"--phantoms is {number}, but it is for --data phantom")
+        raise click.UsageError(f"--phantoms is {number}, but it requires --data phantom")
     if tracking_experiment is not None and (agent is None or video):
         raise click.UsageError(
             "--tracking-experiment is for --agent without --video: the evaluation of a run is tracked in the run's "

@@ -47,7 +47,7 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
     | `cluster` | `clusters`: number, pixels, mean centre of bones, tendons, artery, normalised | (12,) |
     | `slice` | `slice`: the labels, 0 to 4, uint8 | (across, depth) |
     | `slice_channels` | `channels`: masks of bones, tendons, artery, 0 or 1, uint8 | (3, across, depth) |
-    | `slice_metric` | `shares`: shares of bones, tendons, artery in each pixel, uint8 | (3, across, depth) |
+    | `slice_metric` | `shares`: shares of bones, tendons, artery in a pixel, up to 255, uint8 | (3, across, depth) |
     | a list of them | all of them | |
 
     ## Rewards

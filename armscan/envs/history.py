@@ -149,8 +149,8 @@ class FrameHistory:
 class BestPairs:
     """The best (action, reward) pairs of the current episode of each environment of a batch.
 
-    They are ordered from the best to the worst, and with equal rewards from the earliest to the latest. At first all
-    are the first plane's; a new pair enters only if its reward beats the worst one kept.
+    They are ordered from the best to the worst, and with equal rewards from the earliest to the latest. At first, all
+    are the pair of the first plane; a new pair enters only if its reward beats the worst one kept.
 
     Args:
         boxes: Space of each part of one environment.

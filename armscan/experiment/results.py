@@ -25,7 +25,7 @@ from armscan.training import (
 from armscan.training.baselines import RANDOM
 from armscan.training.episode_results import TEST_METRICS, metric_prefix
 from armscan.training.episode_seeds import TEST_VOLUMES_SEED, TRAINING_VOLUMES_SEED
-from armscan.training.headline import ABOVE_RANDOM, MIN_WRISTS, beside_random, headline
+from armscan.training.headline import ABOVE_RANDOM, MIN_SUBJECTS, beside_random, headline
 from armscan.training.metric_display import LEADING
 from armscan.utils.files import atomic_write
 from armscan.utils.run_files import BASELINES_FILE, EVALUATION_FILE, RESULTS_PAGE
@@ -208,7 +208,9 @@ def few_wrists(figures: Mapping[str, MetricEstimates], helps: str = MORE_HELP) -
         figures: Metrics by the word that describes the subjects, which ends with a blank, or is empty.
         helps: What helps. Default: more subjects.
     """
-    few = [counted(each.n_subjects, f"{of}subject") for of, each in figures.items() if 0 < each.n_subjects < MIN_WRISTS]
+    few = [
+        counted(each.n_subjects, f"{of}subject") for of, each in figures.items() if 0 < each.n_subjects < MIN_SUBJECTS
+    ]
     if not few:
         return []
-    return [f"{' and '.join(few)}, fewer than {MIN_WRISTS}: the intervals are too narrow for other subjects; {helps}"]
+    return [f"{' and '.join(few)}, fewer than {MIN_SUBJECTS}: the intervals are too narrow for other subjects; {helps}"]

@@ -106,7 +106,7 @@ def _tag(run: Run, name: str) -> str:
 
 
 def _check_grid(run: Run, words: Sequence[str], uri: str) -> None:
-    """Raise `UntrustedError` if a grid's command line, or its working folder, may be a stranger's."""
+    """Raise `UntrustedError` if a grid's command line, or its working folder, is untrusted."""
     where = f"run {run.info.run_id}"
     check_stored_words(words, uri, where=where)
     # Its `conf/` and `sweeps/` are part of the configuration.

@@ -158,7 +158,7 @@ def read_trainings(store: TrackingStore, runs: Sequence[Run], folder: Path) -> l
         leading = {f"{OF_VALIDATION}{leading_of(migrate(run.data.params)).metric}" for run in runs}
         shown = {WALL, *VALIDATION, *leading}
         histories = metric_histories(store, {run.info.run_id: _wanted(run, shown) for run in runs})
-        # Not by run ID, which a stranger's store may have as a path.
+        # Not by run ID, which may be a path in an untrusted store.
         files = [_files(store, run, folder / str(number)) for number, run in enumerate(runs)]
     return [_training(run, histories[run.info.run_id], of_run) for run, of_run in zip(runs, files, strict=True)]
 

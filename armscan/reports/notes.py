@@ -11,7 +11,7 @@ from armscan.reports.groups import Group, differing_rules
 from armscan.reports.load import TrackedTraining, validation_titles
 from armscan.reports.significance import evaluations_by_seed
 from armscan.stats.aggregation import MIN_SEEDS
-from armscan.training.headline import MIN_WRISTS
+from armscan.training.headline import MIN_SUBJECTS
 from armscan.utils.run_files import ID_CHARS
 
 # From this number of seeds on, the intervals of final figures are nearly as wide as they should be.
@@ -32,7 +32,7 @@ def notes_on(
     notes = [
         *_on_folds(groups),
         *_on_seeds(groups),
-        *_on_wrists(groups),
+        *_on_subjects(groups),
         *_on_unfinished(groups),
         *_on_missing(groups),
         *_on_curves(groups, curves),
@@ -80,13 +80,13 @@ def _on_seeds(groups: Sequence[Group]) -> Iterator[str]:
         )
 
 
-def _on_wrists(groups: Sequence[Group]) -> Iterator[str]:
-    n_wrists = {}
+def _on_subjects(groups: Sequence[Group]) -> Iterator[str]:
+    n_subjects = {}
     for group in groups:
         played = [episode for each in evaluations_by_seed(group).values() for episode in each.episodes]
-        n_wrists[group.number] = len({episode.subject or episode.volume for episode in played})
-    if few := [number for number, n in n_wrists.items() if 0 < n < MIN_WRISTS]:
-        yield f"{_numbered(few, groups)}: fewer than {MIN_WRISTS} test subjects; intervals are too narrow for others."
+        n_subjects[group.number] = len({episode.subject or episode.volume for episode in played})
+    if few := [number for number, n in n_subjects.items() if 0 < n < MIN_SUBJECTS]:
+        yield f"{_numbered(few, groups)}: fewer than {MIN_SUBJECTS} test subjects; intervals are too narrow for others."
 
 
 def _on_unfinished(groups: Sequence[Group]) -> Iterator[str]:

@@ -7,7 +7,8 @@ seeds first; all drawn seeds share the drawn subjects, as all seeds were evaluat
 
 With K subjects, the interval is a little too wide if subjects are alike. If they differ, it is too narrow, by about
 sqrt((K - 1) / K) and more for small K: no resampling knows subjects that it has never seen. If every episode has the
-same value, as at a success rate of 100 %, it has no width; `armscan.stats.proportions.wilson` then gives one, for independent episodes.
+same value, as at a success rate of 100 %, it has no width; `wilson` (`proportions.py`) then gives one, for independent
+episodes.
 """
 
 from __future__ import annotations

@@ -61,7 +61,7 @@ def run_study(arguments: Sequence[str], launch: Callable[[Sequence[str]], object
             final = stored_final_eval(storage, existing)
             if final is not None and is_reconfigured(existing, settings, fixed):
                 print_sentence(
-                    "the configuration has changed: all final trainings begin anew, and open the test volumes"
+                    "the configuration has changed: all final trainings begin anew, and use the test volumes again"
                 )
                 final = None
         print_plan(settings, existing, final, initial)

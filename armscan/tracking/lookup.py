@@ -161,7 +161,7 @@ def find_run(client: TrackingStore, run_id: str) -> Run:
 def run_of_study(
     client: TrackingStore, run_id: str, *, experiment_id: str, tags: Mapping[str, str | None], where: str
 ) -> Run:
-    """Return a run that a study's storage names, once checked: a stranger may have written the ID of any run there.
+    """Return a run that a study's storage names, once checked: an untrusted storage may name any run.
 
     Args:
         client: Client of the store.

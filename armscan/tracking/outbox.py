@@ -70,7 +70,7 @@ class OutboxFile:
             self.address = Address(**next(self.entries())["address"])
         except (StopIteration, TypeError, KeyError) as error:
             raise TrackingError(f"{file}: does not begin with the ID of its run") from error
-        # A stranger's folder could name a run of the user's.
+        # An untrusted folder could name a run of the user's.
         if self.address.run_id != file.stem:
             raise TrackingError(f"{file}: begins with the ID of another run, {self.address.run_id}")
         self._uploaded: dict[Channel, int] = dict.fromkeys(CHANNELS, 0) | self._read_uploaded()
@@ -163,7 +163,7 @@ class Outbox(OutboxFile):
     def __init__(self, file: Path, *, timeout_s: float = LOCK_TIMEOUT_S) -> None:
         # Acquiring the lock would recreate the folder of a removed run.
         file.stat()
-        # Links in a stranger's folder may lead to any file of this user, which this process would write to.
+        # Links in an untrusted folder may lead to any file of this user, which this process would write to.
         links = [each for each in (file.parent, *map(file.with_suffix, OUTBOX_SUFFIXES)) if each.is_symlink()]
         if links:
             raise TrackingError(f"{links[0]}: is a link, but outboxes are files of the run's own folder")
@@ -215,7 +215,7 @@ class Outbox(OutboxFile):
         """Write this machine's note of the run, so that the next start uploads what is left.
 
         Args:
-            uri: Address of the store that this process opened; the one in a stranger's outbox may be another.
+            uri: Address of the store that this process opened; an untrusted outbox may name another.
         """
         # Nothing is lost without the note: `armscan runs sync` finds the outbox.
         with contextlib.suppress(OSError):

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 MODEL_FILE = "MLmodel"
 # Suffix of the name of a run whose trial was pruned.
 PRUNED = " (pruned)"
-# No run of armscan has this many ancestors; a stranger's run may be its own ancestor.
+# No run of armscan has this many ancestors; in an untrusted store, a run may be its own ancestor.
 MAX_DEPTH = 8
 MAX_REASON_CHARS, MAX_DIGITS = 5000, 9
 # Wait for an unavailable store while somebody waits for this process to end.

@@ -162,7 +162,7 @@ def _end(outbox: Outbox, run: Run) -> None:
 
 
 def _check_own(outbox: Outbox, run: Run) -> None:
-    """Raise `UntrustedError` unless the run was tracked from this folder: a stranger's could name any of the user's."""
+    """Raise `UntrustedError` unless the run was tracked from this folder, which could name any other."""
     folder = outbox.folder.resolve()
     note = Note.of(run.info.run_id)
     if note is not None and note.outbox.resolve() == outbox.file.resolve():

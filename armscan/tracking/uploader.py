@@ -141,7 +141,7 @@ def upload(
 
     Raises:
         FileNotFoundError: If a file is missing, and the folder may be an incomplete copy.
-        UntrustedError: If a file outside of the run's folder was added by another process, perhaps a stranger's.
+        UntrustedError: If a file outside of the run's folder was added by another process, which may be untrusted.
     """
     n_uploaded = 0
     while True:

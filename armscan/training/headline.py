@@ -24,8 +24,8 @@ from armscan.utils.text import formatted
 
 # Metric of an agent: difference of its leading on-plane rate from random planes'.
 ABOVE_RANDOM = "on_plane_above_random"
-# With fewer wrists, intervals are clearly too narrow: docs/metrics.md.
-MIN_WRISTS = 8
+# With fewer subjects, intervals are clearly too narrow: docs/metrics.md.
+MIN_SUBJECTS = 8
 # If the difference is the same on all volumes, only rounding gives its interval a width.
 NO_WIDTH = 1e-9
 DISTANCES = (("median_distance_mm", "{:.1f} mm"), ("median_distance_deg", "{:.1f}°"))

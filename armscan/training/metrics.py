@@ -24,7 +24,7 @@ ENDS = ("_low", "_high")
 COUNTS = ("volumes", "subjects", "episodes", "episodes_started_solved")
 # Tracked if there are several.
 SEEDS = "seeds"
-# Only where it is below 1: the share of episodes whose labelled plane shows the nerve.
+# `NERVE_SHOWN`, the share of episodes whose labelled plane shows the nerve, is reported only if it is below 1.
 NERVE_ERROR, NERVE_SHOWN = "nerve_area_error_mm2", "nerve_shown_rate"
 MEDIAN, P90, P95 = quantile(0.5), quantile(0.9), quantile(0.95)
 

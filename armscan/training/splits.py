@@ -17,7 +17,7 @@ from armscan.volumes.dataset import SPLITS
 from armscan.volumes.phantom import VERSIONS
 from armscan.volumes.phantom.generate import PHANTOM_NAME
 
-# Phantoms of different splits never have the same seed.
+# Phantoms of different parts never have the same seed.
 VALIDATION_FIRST_SEED, TEST_FIRST_SEED = 1_000_000, 2_000_000
 
 PARTS = ("training", "validation", "test")
@@ -56,7 +56,7 @@ class Split:
         for part, volumes in self.parts.items():
             for name in volumes:
                 if name in seen:
-                    raise InvalidValueError(f"{name} is in {seen[name]} and in {part}, but it must be in one split")
+                    raise InvalidValueError(f"{name} is in {seen[name]} and in {part}, but it must be in one part")
                 seen[name] = part
         self._check_copies()
 
@@ -69,7 +69,7 @@ class Split:
                 for other, its_part, its_volume in similar:
                     if part != its_part and np.array_equal(volume.labels_yxz, its_volume.labels_yxz):
                         raise InvalidValueError(
-                            f"{name} ({part}) is a copy of {other} ({its_part}), but a wrist must be in one split: "
+                            f"{name} ({part}) is a copy of {other} ({its_part}), but a wrist must be in one part: "
                             "give both the same subject in the manifest, or remove one"
                         )
                 similar.append((name, part, volume))
@@ -163,13 +163,13 @@ def nifti_data(
 
     Args:
         path: Folder of the volumes.
-        validation: Share of the subjects, in (0, 1], rounded up, or names of subjects or volumes. None: the manifest's
-            splits; a quarter if it has none or `test` is given; the next fold with `folds`.
-        test: Share of the subjects, in (0, 1], rounded up, or names of subjects or volumes. None: the manifest's
-            splits; a quarter if it has none or `validation` is given. Must be None with `folds`.
+        validation: Share of the subjects, in (0, 1], rounded up, or names of subjects or volumes. Default: None,
+            the manifest's splits; a quarter if it has none or `test` is given; the next fold with `folds`.
+        test: Share of the subjects, in (0, 1], rounded up, or names of subjects or volumes. Default: None,
+            the manifest's splits; a quarter if it has none or `validation` is given. Must be None with `folds`.
         split_seed: Seed that draws the subjects of shares and folds. Default: 0.
-        folds: Cross-validation: `leave_one_out` makes each subject a fold; a number gives the number of folds. Default:
-            None, no cross-validation.
+        folds: Cross-validation: `leave_one_out` makes each subject a fold; or the number of folds, from 2 to that of
+            the subjects. Default: None, no cross-validation.
         fold: Number of the test fold, from 0. Default: None, no cross-validation.
 
     Raises:

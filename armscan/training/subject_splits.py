@@ -155,5 +155,5 @@ def _check_subjects(parts: dict[str, str], subjects: dict[str, str]) -> None:
         if part != parts[volume]:
             raise InvalidValueError(
                 f"{first[subject]} is for {part} and {volume} for {parts[volume]}, but both are of the subject "
-                f"{subject}, which must be in one split: name all of its volumes, or the subject"
+                f"{subject}, which must be in one part: name all of its volumes, or the subject"
             )

@@ -26,9 +26,9 @@ class SolvedCriterion:
     """Criterion that stops the training before its budget is used up.
 
     Args:
-        success_rate: Lowest success rate on the validation episodes, in [0, 1].
-        mean_steps: Largest mean number of steps on the validation episodes, 1 or more.
-        n_epochs: Number of consecutive epochs that must meet both criteria, 1 or more.
+        success_rate: Lowest success rate on the validation episodes, in [0, 1]. Default: 1.
+        mean_steps: Largest mean number of steps on the validation episodes, 1 or more. Default: 1.2.
+        n_epochs: Number of consecutive epochs that must meet both criteria, 1 or more. Default: 3.
     """
 
     success_rate: float = 1.0
@@ -58,11 +58,12 @@ class Budget:
             once.
         eval_every_env_steps: Environment steps between two validations, 1 or more; rounded up in the same way.
         validation_episodes: Number of episodes of each validation, 1 or more.
-        solved: Criterion that stops the training early; None uses the whole budget.
-        best_by: Criterion that chooses the best epoch, `success` or `distance`; see `Evaluation.score`.
+        solved: Criterion that stops the training early. Default: None, the whole budget is used.
+        best_by: Criterion that chooses the best epoch, `success` or `distance`; see `Evaluation.score`. Default:
+            `success`.
         schedule: Changes of the agent's hyperparameters, a mapping for each: `from_env_steps` and values by keys, such
             as `agent.lr`. Each applies from the first epoch that begins at or after `from_env_steps`; a value lasts
-            until another change of it. None changes nothing.
+            until another change of it. Default: None, no changes.
     """
 
     env_steps: int
@@ -124,9 +125,9 @@ def train(
         budget: Length of the training and of its epochs, in environment steps.
         validate: Function that evaluates the learner on the validation volumes.
         folder: Folder that keeps `best.pt` and `last.pt`.
-        callbacks: Callbacks at the start, after each epoch and at the end.
-        provenance: Origin of the checkpoints, kept in them.
-        earlier: Reports that `resume_from_checkpoint` returned, for a resumed training.
+        callbacks: Callbacks at the start, after each epoch and at the end. Default: none.
+        provenance: Origin of the checkpoints, kept in them. Default: None.
+        earlier: Reports that `resume_from_checkpoint` returned, for a resumed training. Default: none.
         until_env_steps: Environment steps after which this part of the training ends, at the end of an epoch. Default:
             None, at the end of the budget.
 

@@ -147,7 +147,10 @@ def test_learner_stops_where_its_plane_finder_does(phantom):
             "agent.pretraining_env_steps is 200, but it must be below training.env_steps = 200",
         ),
         ({"pretraining_env_steps": 0}, "agent.pretraining_env_steps is 0"),
-        ({"pretraining_env_steps": 3}, "look 12 times before the first gradient step"),
+        (
+            {"pretraining_env_steps": 3},
+            "takes 12 environment steps .3 looks in each., but agent.pretraining_env_steps is 3",
+        ),
         ({"correction_mm": 0.0}, "agent.correction_mm is 0"),
         ({"sac": None}, "agent.sac is None"),
         (
@@ -182,6 +185,6 @@ def test_what_sac_refuses_is_named_by_its_keys(phantom):
 
 def test_pretraining_that_is_too_short_is_named_by_its_key(phantom):
     with pytest.raises(
-        InvalidValueError, match=r"before the first gradient step, but agent\.pretraining_env_steps is 2$"
+        InvalidValueError, match=r"first gradient step takes 12 .*, but agent\.pretraining_env_steps is 2$"
     ):
         made(phantom, pretraining_env_steps=2)

@@ -34,7 +34,7 @@ def test_evaluate_answers_mistakes_in_one_line(evaluate, tmp_path, data_folder):
             "--episodes is 3, but it must be at least 4: ",
         ),
         ([run_id, "--seed=-1"], "Invalid value for '--seed': -1 is not in the range 0<=x<=2147483647."),
-        ([run_id, "--phantoms=3"], "--phantoms is 3, but it is for --data phantom"),
+        ([run_id, "--phantoms=3"], "--phantoms is 3, but it requires --data phantom"),
         ([run_id, "experiment=x"], f"'{run_id} experiment=x' configures an agent: give --agent NAME with it"),
         (
             ["--agent=random", "experiment=best_zy", "--data=phantom"],

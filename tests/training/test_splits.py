@@ -180,7 +180,7 @@ def test_split_refuses_what_are_no_volumes(tiny_volume, volumes):
 def test_split_refuses_a_copy_of_a_volume_in_another_part(tiny_volume):
     other = replace(tiny_volume, labels=np.roll(tiny_volume.labels, 1, axis=0))
     with pytest.raises(
-        InvalidValueError, match=r"c \(test\) is a copy of a \(training\), but a wrist must be in one split"
+        InvalidValueError, match=r"c \(test\) is a copy of a \(training\), but a wrist must be in one part"
     ):
         Split({"a": tiny_volume, "b": replace(tiny_volume)}, {"d": other}, {"c": replace(tiny_volume)})
 

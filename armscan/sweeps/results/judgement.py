@@ -62,7 +62,7 @@ class Difference(NamedTuple):
     probability: Estimate
 
     @property
-    def is_alike(self) -> bool:
+    def is_constant(self) -> bool:
         """Whether all differences are equal up to rounding: then there is no interval."""
         return math.isclose(self.paired.low, self.paired.high, rel_tol=1e-9, abs_tol=1e-12)
 
@@ -70,7 +70,7 @@ class Difference(NamedTuple):
     def verdict(self) -> str:
         """Return `better` or `worse` according to the interval; empty if it includes 0, or there is none."""
         above, below = ("better", "worse") if self.is_higher_better else ("worse", "better")
-        if self.is_alike:
+        if self.is_constant:
             return ""
         return above if self.paired.low > 0 else below if self.paired.high < 0 else ""
 
@@ -80,8 +80,8 @@ class Difference(NamedTuple):
         sizes = (value_text(self.metric, abs(each)).removesuffix("%") for each in self.paired)
         value, low, high = (f"{'-' if each < 0 else '+'}{size}" for each, size in zip(self.paired, sizes, strict=True))
         interval = f"{low} to {high}" if math.isfinite(self.paired.low) else ""
-        if self.is_alike:
-            interval = "none: all differences are alike"
+        if self.is_constant:
+            interval = "none: all differences are equal"
         better = "higher" if self.is_higher_better else "lower"
         return {
             "on the test volumes": f"{title_of(self.metric)} ({better} is better)",
@@ -137,9 +137,9 @@ class Judgement:
             but = "" if self.chosen in self.violated else ", so it could not be chosen"
             notes.append(f"{name} violates {' and '.join(violated)} in the race{but}")
         if self.is_repeated:
-            notes.append("the test volumes were opened before, with another configuration of the study")
+            notes.append("the test volumes were used before, with another configuration of the study")
         if names := ", ".join(map(name_of, self.others)):
-            notes.append(f"the test volumes were opened before for {names}: the study went on after its end")
+            notes.append(f"the test volumes were used before for {names}: the study went on after its end")
         return [*notes, *(volume_notes(self.results[0].figures) if self.results else ())]
 
     @property
@@ -178,7 +178,7 @@ class Judgement:
         first = self.differences[0]
         if math.isnan(first.paired.low):
             return f"{name} was chosen; one seed does not show whether it is better than the control."
-        if first.is_alike:
+        if first.is_constant:
             value = value_text(first.metric, first.paired.value)
             return (
                 f"{name} was chosen; its difference from the control is {value} for every seed and "

@@ -166,7 +166,7 @@ def _videos(final_trials: Sequence[FrozenTrial]) -> str:
     videos: dict[int, str] = {}
     for trial in final_trials:
         files = sorted(Path(trial.user_attrs.get(FOLDER, "nowhere")).glob("seed_*/episode.gif"))
-        # A stranger's folder may have links to any file of this user.
+        # An untrusted folder may have links to any file of this user.
         files = [file for file in files if file.is_file() and file.read_bytes().startswith(GIF)]
         number = trial.user_attrs[FINALIST]
         if files and number not in videos:

@@ -98,7 +98,7 @@ def _outcome(race: Race, number: int) -> str:
         return "chosen"
     if race.standings[number].has_failed:
         return "failed"
-    if race.standings[number].has_left:
+    if race.standings[number].is_withdrawn:
         return "violates a constraint"
     return "not chosen" if race.is_over else "in the race"
 

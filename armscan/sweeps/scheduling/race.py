@@ -45,13 +45,13 @@ class Standing:
         estimate: Mean score with its 95 % interval; NaN before the first round is complete.
         n_seeds: Number of seeds that the estimate is over.
         has_failed: Whether one of its trainings has failed. Default: False.
-        has_left: Whether it has left the race without a failure. Default: False.
+        is_withdrawn: Whether it was withdrawn, because it violates a constraint. Default: False.
     """
 
     estimate: Estimate = UNKNOWN
     n_seeds: int = 0
     has_failed: bool = False
-    has_left: bool = False
+    is_withdrawn: bool = False
 
     @property
     def lower_end(self) -> float:
@@ -64,7 +64,7 @@ class Race:
     """State of a race.
 
     Args:
-        n_trained: Number of trainings that have a score, without those of configurations that have left.
+        n_trained: Number of trainings that have a score, without those of withdrawn configurations.
         missing: Trainings of this round without a score, the running ones included, as pairs of a configuration and a
             seed. Empty if the race is over.
         chosen: Configuration that was chosen; None while the race continues, or if all configurations have failed in
@@ -86,17 +86,19 @@ class Race:
     def leader(self) -> int | None:
         """Configuration with the best mean; None before the first round is complete, or if all have failed."""
         standings = self.standings
-        left = [each for each, of_it in standings.items() if of_it.n_seeds and not (of_it.has_failed or of_it.has_left)]
-        return max(left, key=lambda each: standings[each].estimate.value, default=None)
+        remaining = [
+            each for each, of_it in standings.items() if of_it.n_seeds and not (of_it.has_failed or of_it.is_withdrawn)
+        ]
+        return max(remaining, key=lambda each: standings[each].estimate.value, default=None)
 
 
 def race(scores: Scores, seeds: Sequence[int], *, min_seeds: int, mean_seeds: int) -> Race:
     """Return the state of a race.
 
     All configurations are trained with the first `min_seeds` seeds. Each further round has one training for every three
-    configurations that are left, at least two, where they most increase the probability of a correct selection. The
+    configurations that remain, at least two, where they most increase the probability of a correct selection. The
     race is over when the configurations have `mean_seeds` seeds on average, when the leader is ahead of all others by
-    more than chance explains (one-sided t tests), or when one configuration is left. The one whose interval has the
+    more than chance explains (one-sided t tests), or when one configuration remains. The one whose interval has the
     highest lower end is chosen; the first of equal ones.
 
     Args:
@@ -108,30 +110,30 @@ def race(scores: Scores, seeds: Sequence[int], *, min_seeds: int, mean_seeds: in
         min_seeds: Number of seeds that all configurations get, 1 or more.
         mean_seeds: Maximum number of seeds per configuration on average, `min_seeds` or more.
     """
-    left, standings = list(scores), {configuration: Standing() for configuration in scores}
+    remaining, standings = list(scores), {configuration: Standing() for configuration in scores}
     n_seeds, most = dict.fromkeys(scores, min_seeds), mean_seeds * len(scores)
     while True:
-        due = [(each, seed) for n, seed in enumerate(seeds) for each in left if n < n_seeds[each]]
+        due = [(each, seed) for n, seed in enumerate(seeds) for each in remaining if n < n_seeds[each]]
         if missing := tuple((each, seed) for each, seed in due if seed not in scores[each]):
             # Decide nothing before the round is complete: the trainings must not depend on which of them ends first.
             return Race(sum(n_seeds.values()) - len(missing), missing, None, standings)
-        rows = {each: [scores[each][seed] for seed in seeds[: n_seeds[each]]] for each in left}
-        whole = [each for each in left if not any(map(math.isnan, rows[each]))]
+        rows = {each: [scores[each][seed] for seed in seeds[: n_seeds[each]]] for each in remaining}
+        whole = [each for each in remaining if not any(map(math.isnan, rows[each]))]
         if not whole:
             # All have failed in this round: choose by the round before, or choose none if this is the first.
-            left = [each for each in left if standings[each].n_seeds]
+            remaining = [each for each in remaining if standings[each].n_seeds]
             standings |= {each: replace(standings[each], has_failed=True) for each in standings}
             break
-        standings |= {each: replace(standings[each], has_failed=True) for each in left if each not in whole}
-        left, counts = whole, np.array([n_seeds[each] for each in whole])
-        of_left = np.array(list(zip_longest(*(rows[each] for each in left), fillvalue=0.0))).T
-        means, variances = moments(of_left, counts)
-        standings |= zip(left, _standings(means, variances, counts), strict=True)
-        n_more = min(round_size(len(left)), most - sum(n_seeds.values()), int((len(seeds) - counts).sum()))
-        if n_more <= 0 or len(left) == 1 or is_decided(means, variances, counts):
+        standings |= {each: replace(standings[each], has_failed=True) for each in remaining if each not in whole}
+        remaining, counts = whole, np.array([n_seeds[each] for each in whole])
+        of_remaining = np.array(list(zip_longest(*(rows[each] for each in remaining), fillvalue=0.0))).T
+        means, variances = moments(of_remaining, counts)
+        standings |= zip(remaining, _standings(means, variances, counts), strict=True)
+        n_more = min(round_size(len(remaining)), most - sum(n_seeds.values()), int((len(seeds) - counts).sum()))
+        if n_more <= 0 or len(remaining) == 1 or is_decided(means, variances, counts):
             break
-        n_seeds |= zip(left, allocate(means, variances, counts, n_more, most=len(seeds)).tolist(), strict=True)
-    chosen = max(left, key=lambda each: standings[each].lower_end, default=None)
+        n_seeds |= zip(remaining, allocate(means, variances, counts, n_more, most=len(seeds)).tolist(), strict=True)
+    chosen = max(remaining, key=lambda each: standings[each].lower_end, default=None)
     return Race(sum(n_seeds.values()), (), chosen, standings)
 
 

@@ -133,7 +133,7 @@ def was_retried(trial: FrozenTrial) -> bool:
 
 def retried_by(trial: FrozenTrial | Trial, trials: Sequence[FrozenTrial]) -> Iterator[int]:
     """Yield the numbers of the attempts that a trial replaces, the latest first."""
-    # A stranger may have written any number.
+    # An untrusted storage may hold any number.
     while (number := trial.user_attrs.get(RETRY_OF)) is not None and number < trial.number:
         yield number
         trial = trials[number]

@@ -84,8 +84,8 @@ class FinalEvaluation:
         """Factor that makes higher values of the first objective better."""
         return -1.0 if self.search.directions[0] == StudyDirection.MINIMIZE else 1.0
 
-    def candidates(self) -> list[int]:
-        """Return the control and the numbers of the best trials; nothing if no trial has finished."""
+    def contenders(self) -> list[int]:
+        """Return the control and the numbers of the candidates, the best trials; nothing if no trial has finished."""
         best = best_trials(self.search, self.settings.top_k + 1)
         # A trial with the values of the control is the control, even if taken from another study or a preset.
         others = [trial.number for trial in best if renamed(searched_values(trial)) != self.control]
@@ -94,7 +94,7 @@ class FinalEvaluation:
 
     def scores(self) -> dict[int, dict[int, float]]:
         """Return the score of each ended training of the selection, by candidate and seed; NaN if it failed."""
-        scores: dict[int, dict[int, float]] = {number: {} for number in self.candidates()}
+        scores: dict[int, dict[int, float]] = {number: {} for number in self.contenders()}
         for trial in self._counted_trials(self.selection):
             number, seed = training_of(trial)
             if number not in scores:
@@ -106,9 +106,9 @@ class FinalEvaluation:
         return scores
 
     def race(self, scores: Scores | None = None) -> Race:
-        """Return the state of the selection's race; those that violate a constraint leave it after the first round.
+        """Return the state of the selection's race, from which those that violate a constraint are withdrawn.
 
-        If all violate one, all race.
+        They are withdrawn after the first round. If all violate one, all race.
 
         Args:
             scores: Result of `scores`. Default: None, the current scores.
@@ -120,9 +120,9 @@ class FinalEvaluation:
         if not gone or len(gone) == len(scores):
             return run(scores, mean_seeds=settings.mean_seeds)
         alone = run(gone, mean_seeds=settings.min_seeds).standings
-        left = {number: replace(standing, has_left=True) for number, standing in alone.items()}
+        withdrawn = {number: replace(standing, is_withdrawn=True) for number, standing in alone.items()}
         found = run({number: scores[number] for number in scores if number not in gone}, mean_seeds=settings.mean_seeds)
-        standings = {**left, **found.standings}
+        standings = {**withdrawn, **found.standings}
         return replace(found, standings={number: standings[number] for number in scores})
 
     def violated(self) -> dict[int, list[str]]:

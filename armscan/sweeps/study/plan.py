@@ -151,7 +151,7 @@ def final_trainings_left(settings: StudySettings, final: FinalEvaluation | None,
     if race.is_over:
         return len(wanted) - n_judged, len(wanted) - n_judged
     asked = settings.final_eval
-    n_racing = sum(not each.has_left for each in race.standings.values())
+    n_racing = sum(not each.is_withdrawn for each in race.standings.values())
     bounds = budget(n_racing, min_seeds=asked.min_seeds, mean_seeds=asked.mean_seeds)
     least, most = (max(bound - race.n_trained, len(race.missing)) - n_judged for bound in bounds)
     return least + asked.judge_seeds, most + 2 * asked.judge_seeds

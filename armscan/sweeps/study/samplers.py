@@ -1,4 +1,4 @@
-"""Samplers that read only numbers from a storage, to which a stranger may have written."""
+"""Samplers that read only numbers from a storage that may be untrusted."""
 
 from __future__ import annotations
 

@@ -26,10 +26,11 @@ DEAD_AFTER_S = 40.0
 # With up to this many running trials, each worker checks all of them at each heartbeat; with more it checks less often,
 # because a check costs the storage some time for each running trial.
 MAX_CHECKERS = 64
-# Longest time between two checks that counts as silence, in expected intervals: if it was longer, the storage was
-# unavailable for all workers, and none could renew a lease.
+# The most that the time between two checks adds to a worker's silence, in expected intervals: in a longer time, the
+# storage was unavailable to all workers, and none could renew its lease.
 MAX_UNSEEN = 1.5
-# If the storage is unavailable, the trial cannot be requeued: it is reclaimed later, because its process is gone.
+# Time in which a worker that leaves must requeue its trial. If the storage is unavailable for longer, the trial is
+# reclaimed later, because its process is gone.
 REQUEUE_TIMEOUT_S = 5.0
 # Part of it: the longest wait for a tracked run that is being created. Requeued before the run's ID is stored, a trial
 # would get a second run.

@@ -126,7 +126,7 @@ def test_test_volumes_are_opened_for_the_chosen_configuration_and_the_control_al
     storage_uri,
 ):
     final = run(storage_uri)
-    assert final.candidates() == [CONTROL, 0, 1]
+    assert final.contenders() == [CONTROL, 0, 1]
     assert final.race().chosen == 1
     assert {number for number, _ in trained(final.judgement)} == {CONTROL, 1}
     # The judgement uses no seed of the search or the selection.
@@ -261,9 +261,9 @@ def test_trial_with_the_settings_of_the_control_is_no_candidate_beside_it(storag
     storage, asked, search = searched(storage_uri, top_k=top_k)
     # Neither a sampled trial nor one that was taken over is marked as having them.
     final = open_final_eval(storage, asked, search, search.trials[0].params)
-    assert final.candidates() == candidates
+    assert final.contenders() == candidates
     # As a report reads it.
-    assert stored_final_eval(open_storage(storage_uri), search).candidates() == candidates
+    assert stored_final_eval(open_storage(storage_uri), search).contenders() == candidates
 
 
 def test_training_that_failed_leaves_its_candidate_out_and_the_study_has_a_result(storage_uri):
@@ -302,7 +302,7 @@ def test_study_that_goes_on_says_for_whom_else_the_test_volumes_were_opened(stor
     search.tell(trial, 0.5)
     final = run(storage_uri, true=TRUE | {3: 0.5})
     assert (judge(final).chosen, judge(final).others) == (3, (1,))
-    assert "opened before for trial 1" in judge(final).notes[0]
+    assert "used before for trial 1" in judge(final).notes[0]
 
 
 def test_run_of_a_study_that_goes_on_until_the_control_wins_keeps_no_difference(storage_uri):
@@ -386,7 +386,7 @@ def test_latest_trial_of_each_member_is_trained_with_its_whole_schedule(storage_
     search.tell(behind, 98.0)
     final = open_final_eval(storage, asked, search, None)
     # Better values of earlier generations are not of whole trainings.
-    assert final.candidates() == [CONTROL, behind.number, member.number]
+    assert final.contenders() == [CONTROL, behind.number, member.number]
     planned = [each for each in final.missing_of_selection() if each.attributes[FINALIST] == member.number]
     assert len(planned) == FINAL_EVAL["min_seeds"]
     scheduler = TrialScheduler(final.selection, storage, Limits(n_trials=9), lambda: planned)
@@ -449,7 +449,7 @@ def test_trainings_of_an_earlier_configuration_of_the_study_are_run_again(storag
     again = run(storage_uri, true=dict.fromkeys(TRUE, 5.0) | {1: 4.9}, fixed={"env": {"max_steps": 40}})
     assert judge(again).chosen == CONTROL or judge(again).differences[0].paired.value > -1.0
     assert len(trained(again.judgement)) >= n_before + FINAL_EVAL["judge_seeds"]
-    assert "the test volumes were opened before, with another configuration of the study" in judge(again).notes
+    assert "the test volumes were used before, with another configuration of the study" in judge(again).notes
 
 
 @pytest.mark.parametrize(("constraint", "is_kept"), [("mean_steps >= 2", False), ("mean_steps >= 0", True)])
@@ -474,7 +474,7 @@ def test_control_that_violates_a_constraint_leaves_the_race_after_its_first_roun
 def test_candidate_that_violates_a_constraint_in_the_race_is_not_chosen(storage_uri):
     final = run(storage_uri, true={CONTROL: 2.5, 0: 6.0, 1: 1.0, 2: 9.0}, constraints=["mean_steps >= 2"])
     assert final.violated() == {1: ["mean_steps >= 2"]}
-    assert final.race().standings[1].has_left
+    assert final.race().standings[1].is_withdrawn
     judgement = judge(final)
     assert judgement.chosen == CONTROL
     assert "trial 1 violates mean_steps >= 2 in the race, so it could not be chosen" in judgement.notes

@@ -172,8 +172,8 @@ def test_taken_trial_with_the_values_of_the_control_is_no_candidate_beside_it(st
     final_eval = FinalEvalSettings(top_k=2, min_seeds=1, mean_seeds=1, judge_seeds=1)
     asked, storage, study = made = study_in("now", space, warm_start=["before"], final_eval=final_eval)
     begin(made)
-    assert open_final_eval(storage, asked, study, None).candidates() == [CONTROL, 0, 1]
-    assert open_final_eval(storage, asked, study, control).candidates() == [CONTROL, 1]
+    assert open_final_eval(storage, asked, study, None).contenders() == [CONTROL, 0, 1]
+    assert open_final_eval(storage, asked, study, control).contenders() == [CONTROL, 1]
 
 
 def test_settings_of_a_taken_trial_are_not_tried_again(study_in):
