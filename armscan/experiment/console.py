@@ -13,7 +13,7 @@ from armscan.experiment.results import TITLES
 from armscan.training import TEST, MetricEstimates, ResultTable
 from armscan.training.baselines import RANDOM
 from armscan.training.headline import headline
-from armscan.training.result_table import HOW, with_baselines
+from armscan.training.result_table import with_baselines
 from armscan.utils.console import print_sentence, wide_console
 from armscan.utils.run_files import ID_CHARS
 
@@ -34,8 +34,8 @@ def print_result_table(
     console.print(Text(title, style="italic"))
     for part in table.show(console.width):
         console.print(part)
-    if how and table.quantities:
-        console.print(Text(HOW, style="dim"))
+    if how and table.how:
+        console.print(Text(table.how, style="dim"))
     for note in notes:
         print_sentence(f"note: {note}")
     if table.headline:

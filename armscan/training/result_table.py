@@ -31,6 +31,7 @@ HOW = (
     "half. On plane: share of episodes whose last plane is this close to the labelled one. Success: share of episodes "
     "whose last plane the reward accepts; it may lie far from the labelled one."
 )
+HOW_WITHOUT_EPISODES = "95 % intervals are Student's, for other seeds and subjects; none if all values are equal."
 COUNTS = {"episodes": "n_episodes", "started solved": "n_started_solved", "seeds": "n_seeds", "volumes": "n_volumes"}
 # A heading, and a cell for each line.
 Column = tuple[str, Sequence[str]]
@@ -62,7 +63,13 @@ class ResultTable:
         older = [column for column, better in OLDER.items() if better not in known]
         columns = [*(Quantity(each.metric, each.title, "{:.1%}") for each in limits), *QUANTITIES, *older]
         shown = [column for column in columns if column.metric in known]
-        return shown or [Quantity(name, name.replace("_", " ") + ", mean", "{:.3g}") for name in sorted(known)]
+        return shown or [Quantity(name, name.replace("_", " "), "{:.3g}") for name in sorted(known)]
+
+    @property
+    def how(self) -> str:
+        """How the figures are computed; empty without figures."""
+        has_episodes = any(each.n_episodes for each in self.results.values())
+        return (HOW if has_episodes else HOW_WITHOUT_EPISODES) if self.quantities else ""
 
     def show(self, width: int) -> list[Table | Text]:
         """Return the table for a terminal: a few results side by side, many as lines.
@@ -94,7 +101,7 @@ class ResultTable:
         drawn = f'<table class="rows"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>'
         kind = "results" if is_few else "results lines"
         said = f"<p><strong>{html.escape(self.headline)}</strong></p>" if self.headline else ""
-        return f'{said}<div class="{kind}"><div class="table">{drawn}</div><p><small>{HOW}</small></p></div>'
+        return f'{said}<div class="{kind}"><div class="table">{drawn}</div><p><small>{self.how}</small></p></div>'
 
     def markdown(self) -> str:
         """Return the table in Markdown, a column for each result."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,10 +13,11 @@ from numpy.typing import NDArray
 from optuna.trial import FrozenTrial, TrialState
 
 from armscan.errors import StudyError
+from armscan.stats.bootstrap import Estimate
 from armscan.stats.on_plane import limits_among
-from armscan.stats.paired import mean_over_seeds
+from armscan.stats.paired import mean_over_seeds, of_subjects
 from armscan.sweeps.scheduling.state import TEST_PREFIX
-from armscan.sweeps.storage.attribute_names import EPISODES, FINAL_SEED, FINALIST, FIXED, METRICS
+from armscan.sweeps.storage.attribute_names import EPISODES, FINAL_SEED, FINALIST, FIXED, METRICS, SUBJECTS
 from armscan.sweeps.study.candidates import name_of
 from armscan.training import TEST, Evaluation, MetricEstimates, ResultTable
 from armscan.training.baselines import RANDOM
@@ -58,8 +60,8 @@ def final_table(results: Sequence[ConfigResult]) -> ResultTable:
 def final_results(trials: Sequence[FrozenTrial]) -> list[ConfigResult]:
     """Return the final evaluation of each configuration, over all episodes of all its trainings.
 
-    The intervals resample seeds and subjects; all drawn seeds share the drawn subjects. Older trials stored no
-    episodes; their intervals come from the means of seeds and volumes.
+    The intervals resample seeds and subjects; all drawn seeds share the drawn subjects. Trials without
+    episodes have intervals from the means of seeds and volumes.
 
     Args:
         trials: Trials of the final evaluation; unfinished ones are left out.
@@ -74,7 +76,7 @@ def final_results(trials: Sequence[FrozenTrial]) -> list[ConfigResult]:
 def _config_result(number: int, of_seeds: Sequence[FrozenTrial]) -> ConfigResult:
     kept = [_episodes(trial) for trial in of_seeds]
     if not all(kept):
-        return ConfigResult(number, _of_means([trial.user_attrs[METRICS] for trial in of_seeds]), {})
+        return ConfigResult(number, _of_means(of_seeds), {})
     seeds = [trial.user_attrs[FINAL_SEED] for trial in of_seeds]
     figures = MetricEstimates.of_trainings(dict(zip(seeds, (each[TEST] for each in kept), strict=True)))
     # Baselines do not depend on the training: they are the same for each seed.
@@ -93,17 +95,24 @@ def _episodes(trial: FrozenTrial) -> dict[str, Evaluation]:
     return found
 
 
-def _of_means(of_seeds: Sequence[Mapping[str, float]]) -> MetricEstimates:
-    """Return the means of the metrics that all seeds have, with intervals for other seeds and volumes."""
+def _of_means(trials: Sequence[FrozenTrial]) -> MetricEstimates:
+    """Return the means of the metrics that all seeds have, with intervals for other seeds and subjects."""
+    of_seeds, subject_of = [trial.user_attrs[METRICS] for trial in trials], subjects_of(trials)
     common = set.intersection(*map(set, of_seeds))
     of_seeds = [{name: value for name, value in metrics.items() if name in common} for metrics in of_seeds]
     names = [name for name in of_seeds[0] if name.startswith(TEST_PREFIX) and not OF_VOLUME.fullmatch(name)]
-    means = {name.removeprefix(TEST_PREFIX): mean_over_seeds(scores_of(name, of_seeds)[1]) for name in names}
+    means = {name.removeprefix(TEST_PREFIX): _mean_of(name, of_seeds, subject_of) for name in names}
     volumes = {match[1] for name in common if (match := OF_VOLUME.fullmatch(name))}
     episodes, solved = (sum(int(each.get(TEST_PREFIX + name, 0)) for each in of_seeds) for name in COUNTS[2:])
-    # Trials that stored no episodes did not know subjects either.
-    n_volumes = len(volumes)
-    return MetricEstimates(len(of_seeds), n_volumes, n_volumes, episodes, solved, means, limits_among(means))
+    n_subjects = len({subject_of.get(volume, volume) for volume in volumes})
+    return MetricEstimates(len(of_seeds), len(volumes), n_subjects, episodes, solved, means, limits_among(means))
+
+
+def _mean_of(name: str, of_seeds: Sequence[Mapping[str, float]], subject_of: Mapping[str, str]) -> Estimate:
+    volumes, scores = scores_of(name, of_seeds)
+    found = mean_over_seeds(of_subjects(scores, [subject_of.get(volume, volume) for volume in volumes]))
+    # Equal scores do not say how others would differ.
+    return Estimate(found.value, math.nan, math.nan) if found.low == found.high else found
 
 
 def bounds_in(search: optuna.Study, metric: str) -> tuple[float, float]:
@@ -113,8 +122,12 @@ def bounds_in(search: optuna.Study, metric: str) -> tuple[float, float]:
 
 
 def subjects_of(trials: Sequence[FrozenTrial]) -> dict[str, str]:
-    """Return the subject of each test volume; empty for older trials, which stored no episodes."""
-    return subject_of_volumes(played[TEST] for trial in trials if (played := _episodes(trial)))
+    """Return the subject of each test volume; empty for older trials, which stored neither episodes nor subjects."""
+    kept = [trial.system_attrs.get(SUBJECTS, {}) for trial in trials]
+    if not all(isinstance(each, dict) and all(isinstance(name, str) for name in each.values()) for each in kept):
+        raise StudyError(f"the {SUBJECTS} of a final training in the storage are damaged")
+    played = subject_of_volumes(each[TEST] for trial in trials if (each := _episodes(trial)))
+    return {volume: subject for each in (*kept, played) for volume, subject in each.items()}
 
 
 def scores_of(name: str, of_seeds: Sequence[Mapping[str, float]]) -> tuple[list[str], NDArray[np.float64]]:

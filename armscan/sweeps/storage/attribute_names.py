@@ -35,5 +35,5 @@ KEPT_BY_RETRY = (
 
 # In a lease: the worker that holds the trial.
 HOLDER = ("worker", "host", "pid", "started", "boot", "pid_namespace")
-# A system attribute of a trial: the episodes of the final evaluation.
-EPISODES = "episodes"
+# System attributes of a trial: the episodes of the final evaluation; without episodes, the subject of each test volume.
+EPISODES, SUBJECTS = "episodes", "subjects"

@@ -20,7 +20,7 @@ from armscan.errors import InvalidValueError, listed
 from armscan.stats.bootstrap import interquartile_mean, mean
 from armscan.sweeps.scheduling.claim import PendingWrites
 from armscan.sweeps.scheduling.state import retried_by
-from armscan.sweeps.storage.attribute_names import ENV_STEPS, EPISODES, INTERVAL, PARENT, RETRY_OF, RUN, SEEDS
+from armscan.sweeps.storage.attribute_names import ENV_STEPS, EPISODES, INTERVAL, PARENT, RETRY_OF, RUN, SEEDS, SUBJECTS
 from armscan.sweeps.storage.reports import reports_of, store_report
 from armscan.tracking import TrackedRun
 from armscan.training import Evaluation, Split
@@ -121,15 +121,18 @@ class Attempt:
             self.writes.flush_with(self.transaction, lambda: True)
 
     def keep_episodes(self, evaluations: Mapping[str, Evaluation]) -> None:
-        """Store the episodes of the final evaluation, by the name of their volumes or baseline.
+        """Store the episodes of the final evaluation, by the name of their volumes or baseline."""
+        plain = {name: {"on_plane": each.on_plane, "episodes": each.columns()} for name, each in evaluations.items()}
+        self._keep(EPISODES, plain)
 
-        They are not user attributes, which the dashboard would show in full.
-        """
-        plain: dict[str, Any] = {
-            name: {"on_plane": each.on_plane, "episodes": each.columns()} for name, each in evaluations.items()
-        }
+    def keep_subjects(self, subjects: Mapping[str, str]) -> None:
+        """Store the subject of each test volume, by its name, for a task without episodes."""
+        self._keep(SUBJECTS, dict(subjects))
+
+    def _keep(self, name: str, value: dict[str, Any]) -> None:
+        # Not a user attribute, which the dashboard would show in full.
         storage, trial_id = self.trial.storage, self.trial._trial_id
-        self.writes.append(partial(storage.set_trial_system_attr, trial_id, EPISODES, plain))
+        self.writes.append(partial(storage.set_trial_system_attr, trial_id, name, value))
 
     def report(
         self,

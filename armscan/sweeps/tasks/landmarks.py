@@ -58,6 +58,8 @@ class LandmarksTask:
     def evaluate(self, attempt: Attempt) -> dict[str, float]:
         """Return the metrics on the test volumes, all and each. See `Task.evaluate`."""
         rewards = self._rewards(attempt, "test")
+        volumes = volumes_of(attempt.config(attempt.seeds[0])[0]).test
+        attempt.keep_subjects({name: volume.subject or name for name, volume in volumes.items()})
         figures = {f"{TEST_PREFIX}{name}": value for name, value in _metrics_of(rewards).items()}
         for volume, pair in rewards.items():
             of_volume = _metrics_of({volume: pair})

@@ -10,7 +10,7 @@ from scipy.stats import ttest_1samp
 
 from armscan.errors import StudyError
 from armscan.sweeps.results.final_results import final_results, final_table, scores_of
-from armscan.sweeps.storage.attribute_names import EPISODES, FINAL_SEED, FINALIST, METRICS
+from armscan.sweeps.storage.attribute_names import EPISODES, FINAL_SEED, FINALIST, METRICS, SUBJECTS
 from armscan.training import Evaluation
 from tests.training.test_result_table import made_episodes, recomputed
 
@@ -33,7 +33,24 @@ def test_verdict_is_over_seeds_and_test_volumes():
     mean, low, high = result.figures.estimates["mean_steps"]
     assert mean == pytest.approx(scores.mean())
     assert low < mean < high
-    assert result.figures.estimates["success_rate"] == (1.0, 1.0, 1.0)
+    assert result.figures.estimates["success_rate"].value == 1.0
+    # All scores are equal.
+    assert np.isnan(result.figures.estimates["success_rate"][1:]).all()
+
+
+def test_volumes_of_one_subject_count_as_one_also_without_episodes():
+    scores, subjects = np.array([[1.0, 1.2, 3.0, 3.4]] * 2), {"v0": "a", "v1": "a", "v2": "b", "v3": "b"}
+    trials = [judged(0, figures_of(list(of_seed))) for of_seed in scores]
+    (alone,) = final_results(trials)
+    for trial in trials:
+        trial.system_attrs = {SUBJECTS: subjects}
+    (result,) = final_results(trials)
+    assert (alone.figures.n_subjects, result.figures.n_subjects, result.figures.n_volumes) == (4, 2, 4)
+    expected = ttest_1samp([1.1, 3.2], 0.0).confidence_interval()
+    assert result.figures.estimates["mean_steps"] == pytest.approx((2.15, *expected))
+    trials[0].system_attrs = {SUBJECTS: {"v0": 3}}
+    with pytest.raises(StudyError, match="the subjects of a final training in the storage are damaged"):
+        final_results(trials)
 
 
 def test_verdict_of_the_same_trials_is_the_same_and_lacks_those_that_have_not_finished():

@@ -18,6 +18,9 @@ class Trial:
     def __init__(self, *overrides):
         self._words = ["sweep=landmarks", *FEW, *overrides]
 
+    def keep_subjects(self, subjects):
+        self.subjects = subjects
+
     def config(self, seed):
         return compose_run([*self._words, f"seed={seed}"])
 
@@ -34,10 +37,12 @@ def test_landmarks_of_the_published_clusters_are_there_at_labelled_planes_and_no
 
 
 def test_evaluation_has_the_metrics_of_each_test_volume():
-    figures = LandmarksTask().evaluate(Trial("data.n_test=2"))
+    trial = Trial("data.n_test=2")
+    figures = LandmarksTask().evaluate(trial)
     of_volumes = [value for name, value in figures.items() if name.startswith("test/volume/") and "separation" in name]
     assert len(of_volumes) == 2
     assert figures["test/separation"] == pytest.approx(sum(of_volumes) / 2)
+    assert len(set(trial.subjects.values())) == len(trial.subjects) == 2
 
 
 def test_landmarks_that_cannot_be_told_apart_are_worth_less():
