@@ -58,7 +58,7 @@ def report(study: str | None, runs: str | None, out: Path | None, watch: bool, s
         # Deferred: command-line errors are reported before these are loaded.
         from armscan.reports.runs import compare_runs
 
-        file = compare_runs(runs, tracking, None if out is None else str(out))
+        file = compare_runs(runs, tracking, out)
     elif study is not None:
         write = _reporter_on_study(study, storage, out)
         if watch:

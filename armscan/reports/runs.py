@@ -18,7 +18,7 @@ REPORTS = Path("reports")
 MAX_NAME_CHARS, SUM_CHARS = 60, 12
 
 
-def compare_runs(text: str, uri: str, out: str | None) -> Path:
+def compare_runs(text: str, uri: str, out: Path | None) -> Path:
     """Write a report that compares runs.
 
     Args:
@@ -48,7 +48,7 @@ def compare_runs(text: str, uri: str, out: str | None) -> Path:
     n_runs = counted(len(trainings), "run")
     experiments = [name.removeprefix(EXPERIMENT) for name in named if name.startswith(EXPERIMENT)]
     title = f"{n_runs} of {', '.join(experiments)}" if len(experiments) == len(named) else n_runs
-    return write_comparison(groups, left_out, title, Path(out) if out else REPORTS / _folder_name(named))
+    return write_comparison(groups, left_out, title, out or REPORTS / _folder_name(named))
 
 
 def _folder_name(named: Sequence[str]) -> str:
