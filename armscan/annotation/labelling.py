@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from armscan.anatomy import SUCCESS_THRESHOLD, FoundPlane, LandmarkReward, PlaneScorer, Tissues, find_optimal_plane
+from armscan.anatomy import FoundPlane, LandmarkReward, PlaneScorer, Tissues, find_optimal_plane
 from armscan.envs.rendering import ReferencePlane, draw_plane, view_of
 from armscan.errors import ArmscanError, InvalidValueError, MarkupError, OptimalPlaneError, listed
 from armscan.utils.console import print_sentence
@@ -110,9 +110,7 @@ def _search(options: LabellingOptions) -> Search:
     """Return the function that finds or reads the plane of a volume."""
     if options.markup is not None:
         return partial(_drawn, options.markup, options.tissues)
-    return options.search or partial(
-        find_optimal_plane, success_threshold=SUCCESS_THRESHOLD, clustering=options.tissues
-    )
+    return options.search or partial(find_optimal_plane, clustering=options.tissues)
 
 
 def _drawn(markup: Path, tissues: Tissues, volume: LabelVolume) -> FoundPlane:
