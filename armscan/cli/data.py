@@ -32,8 +32,6 @@ if TYPE_CHECKING:
 
 # Folder of pictures within the folder of the data.
 PICTURES = "labelling"
-# Tissues that a labelled plane shows.
-LANDMARKS = ("bones", "tendons", "artery")
 # Names of files that are listed.
 N_LISTED = 8
 
@@ -198,7 +196,7 @@ def _print_dataset(dataset: Dataset, folder: Path) -> None:
 
 def _plane_of(volume: LabelVolume) -> str:
     from armscan.envs.scene import reachable_optimum
-    from armscan.volumes.labelmap import TISSUE_LABELS
+    from armscan.volumes.labelmap import LANDMARKS, TISSUE_LABELS
 
     if volume.optimal_action is None:
         return "no labelled plane"
