@@ -7,7 +7,6 @@ from typing import Any
 from gymnasium import spaces
 from tianshou.utils.net.common import ModuleWithVectorOutput, Net
 from tianshou.utils.net.continuous import ContinuousActorProbabilistic as Actor
-from tianshou.utils.net.continuous import ContinuousCritic
 from torch import nn
 
 
@@ -27,11 +26,6 @@ def mlp_body(space: spaces.Space[Any], hidden_sizes: list[int], activation: str,
         activation=getattr(nn, activation),
         concat=n_action > 0,
     )
-
-
-def mlp_critic(body: Net) -> nn.Module:
-    """Return a critic of fully connected layers."""
-    return init_linear(ContinuousCritic(preprocess_net=body))
 
 
 def gaussian_actor(body: ModuleWithVectorOutput, n_action: int, log_std: float | None) -> Actor:

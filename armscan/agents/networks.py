@@ -86,9 +86,12 @@ class MLP:
 
     def critic(self, observation_space: spaces.Space[Any], n_action: int = 0) -> nn.Module:
         """See `Network.critic`."""
-        from armscan.agents.network_modules import mlp_body, mlp_critic
+        from tianshou.utils.net.continuous import ContinuousCritic
 
-        return mlp_critic(mlp_body(observation_space, self.hidden_sizes, self.activation, n_action))
+        from armscan.agents.network_modules import init_linear, mlp_body
+
+        body = mlp_body(observation_space, self.hidden_sizes, self.activation, n_action)
+        return init_linear(ContinuousCritic(preprocess_net=body))
 
 
 class NetworkByObservation:
