@@ -70,14 +70,11 @@ class MetricSliceObservation:
         for view, image in zip(views, shares, strict=True):
             geometry = view.geometry
             if geometry not in self._overlaps:
-                self._overlaps[geometry] = self._overlaps_with(geometry)
+                axes = zip(geometry.shape, geometry.pixel_mm, self._shape, self._pixel_mm, strict=True)
+                across, depth = (_overlaps(*axis) for axis in axes)
+                self._overlaps[geometry] = across, depth
             _pool(view.slice_xz, *self._overlaps[geometry], image)
         return {"shares": shares}
-
-    def _overlaps_with(self, geometry: SliceGeometry) -> tuple[Overlaps, Overlaps]:
-        axes = zip(geometry.shape, geometry.pixel_mm, self._shape, self._pixel_mm, strict=True)
-        across, depth = (_overlaps(*axis) for axis in axes)
-        return across, depth
 
 
 def _overlaps(n: int, size_mm: float, m: int, pixel_mm: float) -> Overlaps:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -92,8 +92,8 @@ def evaluate_and_track(
         text = json.dumps(report.to_dict(), indent=1, allow_nan=False)
         atomic_write(file, text, follow_link=True)
         shown = own.with_suffix(".html")
-        contents = _html(tracked.name, report, prepared.notes)
-        atomic_write(shown, contents)
+        tables = (f"<h2>{html.escape(label)}</h2>{table.html()}" for label, table in report.tables().items())
+        atomic_write(shown, page(tracked.name, "".join(tables), notes=prepared.notes))
         tracked.log_files(file, shown)
     return report, file
 
@@ -104,12 +104,6 @@ def _store_of(source: EvaluatedAgent, store: Mapping[str, Any]) -> tuple[Trackin
         return open_store(**store)
     check_artifacts(source.run.client, source.run.experiment_id)
     return source.run.client, source.run.experiment_id
-
-
-def _html(title: str, report: EvaluationReport, notes: Sequence[str]) -> str:
-    """Return the page of an evaluation: its notes, and a table for each split."""
-    tables = "".join(f"<h2>{html.escape(label)}</h2>{table.html()}" for label, table in report.tables().items())
-    return page(title, tables, notes=notes)
 
 
 def _check_out(out: Path | None) -> None:

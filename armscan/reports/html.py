@@ -125,7 +125,8 @@ def write_page(
             )
     folder.mkdir(parents=True, exist_ok=True)
     for name, rows in tables.items():
-        _write_csv(folder / f"{name}.csv", rows)
+        with (folder / f"{name}.csv").open("w", newline="") as opened:
+            write_csv(opened, _columns(rows), rows)
     links = "".join(f'<li><a href="{each}.csv">{each}.csv</a></li>' for each in tables)
     body = "\n".join([*parts, f"<h2>Numbers</h2><ul>{links}</ul>"])
     file = folder / REPORT_FILE
@@ -210,11 +211,6 @@ def _cell(key: str, value: Any) -> str:
     kind = " class=number" if is_number else " class=word" if is_word else ""
     # An empty cell is not shown on a phone.
     return f"<td{kind}{label}>{f'<div>{contents}</div>' if contents else ''}</td>"
-
-
-def _write_csv(file: Path, rows: Sequence[Row]) -> None:
-    with file.open("w", newline="") as opened:
-        write_csv(opened, _columns(rows), rows)
 
 
 def _columns(rows: Sequence[Row]) -> list[str]:
