@@ -7,7 +7,7 @@ import logging
 import os
 import sqlite3
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -226,27 +226,20 @@ def _experiment_in(store: TrackingStore, name: str, artifacts: str | None) -> st
     if found is None:
         _check_writable(location)
         try:
-            experiment_id = str(store.create_experiment(name, artifact_location=location))
+            store.create_experiment(name, artifact_location=location)
         except MlflowException as error:
             # Another process has just created it, or this one has, and only the reply was lost.
             if error.error_code != "RESOURCE_ALREADY_EXISTS":
                 raise
-            found = store.get_experiment_by_name(name)
-        else:
-            check_artifacts(store, experiment_id)
-            _keep_view(store, experiment_id, {})
-            return experiment_id
+        found = store.get_experiment_by_name(name)
     if found.lifecycle_stage != "active":
         raise TrackingError(f"tracking.experiment is {name!r}, but it was deleted; restore it, or name another")
     _check_artifacts_in(found.artifact_location, store.uri)
-    _keep_view(store, str(found.experiment_id), found.tags)
-    return str(found.experiment_id)
-
-
-def _keep_view(store: TrackingStore, experiment_id: str, tags: Mapping[str, str]) -> None:
-    """Add the saved view of runs to an experiment, or replace one of another version."""
-    if tags.get(VIEW_TAG) != VIEW:
+    experiment_id = str(found.experiment_id)
+    # The saved view of runs: there is none yet, or another version's.
+    if found.tags.get(VIEW_TAG) != VIEW:
         store.set_experiment_tag(experiment_id, VIEW_TAG, VIEW)
+    return experiment_id
 
 
 def check_artifacts(store: TrackingStore, experiment_id: str) -> None:
