@@ -90,12 +90,6 @@ def test_vector_env_resets_only_those_that_are_marked(phantom):
             assert_same(ours.reset(options={"reset_mask": ended}), theirs.reset(options={"reset_mask": ended.copy()}))
 
 
-def test_vector_env_takes_a_volume_for_all(dataset):
-    envs = ArmscanVectorEnv(2, dataset)
-    name = list(dataset)[2]
-    assert envs.reset(seed=0, options={"volume": name})[1]["volume"].tolist() == [name, name]
-
-
 @pytest.mark.parametrize("variant", VARIANTS, ids=str)
 def test_vector_env_takes_steps_in_some_environments_only(volumes, variant):
     """Each environment steps at its own pace, and gives what it gives alone."""
@@ -120,8 +114,9 @@ def test_vector_env_takes_steps_in_some_environments_only(volumes, variant):
             running[i] = not (terminated[row] or truncated[row])
 
 
-def test_vector_env_takes_a_volume_for_each(dataset):
+def test_vector_env_takes_a_volume_for_all_or_one_for_each(dataset):
     envs, names = ArmscanVectorEnv(3, dataset), list(dataset)
+    assert envs.reset(seed=0, options={"volume": names[2]})[1]["volume"].tolist() == [names[2]] * 3
     chosen = [names[2], names[0], names[2]]
     assert envs.reset(seed=0, options={"volume": chosen})[1]["volume"].tolist() == chosen
     for wrong in (names[:2], [*names[:2], "nope"], [*names[:2], 3]):
