@@ -103,24 +103,18 @@ def test_multimodal_brings_labels_to_0_to_1(phantom):
 
 
 @pytest.mark.parametrize(
-    "arguments",
+    ("kind", "key", "value"),
     [
-        {"hidden_sizes": (0,)},
-        {"hidden_sizes": (16385,)},
-        {"hidden_sizes": "64"},
-        {"hidden_sizes": 64},
-        {"activation": "step"},
+        *((MLP, "hidden_sizes", sizes) for sizes in ((0,), (16385,), "64", 64)),
+        (MLP, "activation", "step"),
+        (Multimodal, "filters", (1, 2)),
+        (Multimodal, "vector_sizes", (0,)),
+        (Multimodal, "head_sizes", "512"),
     ],
 )
-def test_mlp_refuses_impossible_layers(arguments):
-    with pytest.raises(InvalidValueError, match=next(iter(arguments))):
-        MLP(**arguments)
-
-
-@pytest.mark.parametrize("arguments", [{"filters": (1, 2)}, {"vector_sizes": (0,)}, {"head_sizes": "512"}])
-def test_multimodal_refuses_impossible_layers(arguments):
-    with pytest.raises(InvalidValueError, match=next(iter(arguments))):
-        Multimodal(**arguments)
+def test_network_refuses_impossible_layers(kind, key, value):
+    with pytest.raises(InvalidValueError, match=f"network.{key} is"):
+        kind(**{key: value})
 
 
 @pytest.mark.parametrize(
