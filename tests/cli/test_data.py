@@ -3,16 +3,27 @@
 import shutil
 
 import numpy as np
+import pytest
 
 from armscan.cli.main import main
 
 
-def test_data_command_tells_what_each_volume_holds(write_labelmap, tmp_path, monkeypatch, capsys):
+@pytest.fixture
+def inspected(tmp_path, monkeypatch, capsys):
+    """Return a function that inspects the temporary folder and returns what is printed."""
     # Set in the workers of pytest-xdist.
     monkeypatch.delenv("COLUMNS", raising=False)
-    write_labelmap("a.nrrd")
-    write_labelmap("b.nrrd")
-    write_labelmap("c.nrrd")
+
+    def printed():
+        assert main(["data", "inspect", str(tmp_path)]) == 0
+        return capsys.readouterr().out
+
+    return printed
+
+
+def test_data_command_tells_what_each_volume_holds(write_labelmap, tmp_path, inspected):
+    for name in ("a.nrrd", "b.nrrd", "c.nrrd"):
+        write_labelmap(name)
     (tmp_path / "manifest.yaml").write_text(
         "labels: {bones: [1], tendons: [2], artery: [3], nerve: [4]}\n"
         "splits: {train: [S1, b.nrrd]}\n"
@@ -21,8 +32,7 @@ def test_data_command_tells_what_each_volume_holds(write_labelmap, tmp_path, mon
         "  b.nrrd: {}\n"
         "  c.nrrd: {exclude: '[bold] motion'}\n"
     )
-    assert main(["data", "inspect", str(tmp_path)]) == 0
-    printed = capsys.readouterr().out
+    printed = inspected()
     for part in (
         "a.nrrd: subject S1, for train, a labelled plane",
         "30 x 11 x 12 voxels of 0.3 x 0.4 x 0.5 mm, axes towards LPS; read from 30 x 20 x 12",
@@ -38,56 +48,44 @@ def test_data_command_tells_what_each_volume_holds(write_labelmap, tmp_path, mon
         assert part in printed
 
 
-def test_data_command_notes_a_palm_at_low_z_and_a_plane_that_misses_the_volume(
-    data_folder, tmp_path, monkeypatch, capsys
-):
-    # Set in the workers of pytest-xdist.
-    monkeypatch.delenv("COLUMNS", raising=False)
+def test_data_command_notes_a_palm_at_low_z_and_a_plane_that_misses_the_volume(data_folder, tmp_path, inspected):
     volume = next(data_folder.glob("*.nii.gz"))
     shutil.copyfile(volume, tmp_path / volume.name)
     manifest = tmp_path / "manifest.yaml"
     manifest.write_text(f"orientation: LPI\nvolumes: {{{volume.name}: {{rotation: [0, 0], translation: [0, 5000]}}}}\n")
-    assert main(["data", "inspect", str(tmp_path)]) == 0
-    printed = capsys.readouterr().out
+    printed = inspected()
     assert "a labelled plane that misses the volume" in printed
     assert "note: the palm is at low z" in printed
     manifest.write_text("orientation: LPS\n")
-    assert main(["data", "inspect", str(tmp_path)]) == 0
-    assert "note:" not in capsys.readouterr().out
+    assert "note:" not in inspected()
 
 
 def test_data_command_notes_coarse_voxels_a_size_that_no_arm_has_and_a_plane_without_landmarks(
-    write_labelmap, tmp_path, monkeypatch, capsys
+    write_labelmap, tmp_path, inspected
 ):
-    # Set in the workers of pytest-xdist.
-    monkeypatch.delenv("COLUMNS", raising=False)
     labels = np.zeros((20, 30, 10), int)
     labels[5:10, 10:20, 2], labels[5:10, 10:20, 5], labels[5:10, 10:12, 8] = 1, 2, 3
     manifest = tmp_path / "manifest.yaml"
     manifest.write_text("volumes: {a.nrrd: {rotation: [0, 0], translation: [0, 15]}}")
     write_labelmap("a.nrrd", labels, (1.0, 1.0, 1.0))
-    assert main(["data", "inspect", str(tmp_path)]) == 0
-    printed = capsys.readouterr().out
+    printed = inspected()
     assert "a.nrrd: subject a.nrrd, a labelled plane that shows no artery\n" in printed
     assert "note: pixels of 1 x 1 mm are coarse" in printed
     assert "mm large" not in printed
     manifest.write_text("spacing: [0.27, 0.27, 0.55]\nvolumes: {a.nrrd: {rotation: [0, 0], translation: [0, 10]}}")
-    assert main(["data", "inspect", str(tmp_path)]) == 0
-    printed = capsys.readouterr().out
+    printed = inspected()
     assert "a.nrrd: subject a.nrrd, a labelled plane\n" in printed
     assert "note:" not in printed
     write_labelmap("a.nrrd", labels, (0.001, 0.001, 0.001))
     manifest.write_text("{}")
-    assert main(["data", "inspect", str(tmp_path)]) == 0
-    assert "note: the volume is 0.02 x 0.03 x 0.01 mm large: is the spacing" in capsys.readouterr().out
+    assert "note: the volume is 0.02 x 0.03 x 0.01 mm large: is the spacing" in inspected()
 
 
-def test_data_command_needs_no_manifest_and_lists_what_it_does_not_read(write_labelmap, tmp_path, capsys):
+def test_data_command_needs_no_manifest_and_lists_what_it_does_not_read(write_labelmap, tmp_path, inspected):
     write_labelmap("a.nrrd")
     for name in ("manifst.yaml", "b.nhdr", ".hidden"):
         (tmp_path / name).touch()
-    assert main(["data", "inspect", str(tmp_path)]) == 0
-    printed = capsys.readouterr().out
+    printed = inspected()
     assert "a.nrrd: subject a.nrrd, no labelled plane" in printed
     assert "not read: b.nhdr, manifst.yaml" in printed
 
