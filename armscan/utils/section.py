@@ -1,4 +1,4 @@
-"""Sections of a configuration, checked with Pydantic."""
+"""Sections of a configuration or a manifest, checked with Pydantic."""
 
 from __future__ import annotations
 

@@ -8,9 +8,10 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, ValidationError, model_validator
 
 from armscan.errors import InvalidValueError, ManifestError, listed, printable
+from armscan.utils.section import Section
 from armscan.utils.validation import check_float, check_numbers
 from armscan.volumes.labelmap import LabelMap
 from armscan.volumes.orientation import Crop, check_axes, check_crop, check_orientation
@@ -65,14 +66,8 @@ Labels = Annotated[LabelMap, BeforeValidator(LabelMap.from_mapping)]
 Overlap = Literal["refuse", "first", "last"]
 
 
-class _Strict(BaseModel):
-    """Model that accepts no unknown keys and converts no values."""
-
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, arbitrary_types_allowed=True)
-
-
-class _Settings(_Strict):
-    """Keys allowed in an entry and at the top of a manifest; a key's description states its allowed values."""
+class _Settings(Section):
+    """Keys allowed in an entry and at the top of a manifest."""
 
     labels: Labels | None = None
     orientation: Orientation = None
@@ -107,7 +102,7 @@ class VolumeEntry(_Settings):
         return ManipulatorAction((self.rotation[0], self.rotation[1]), (self.translation[0], self.translation[1]))
 
 
-class Splits(_Strict):
+class Splits(Section):
     """Subjects of each split."""
 
     train: Annotated[tuple[str, ...], BeforeValidator(_subjects)] = ()
