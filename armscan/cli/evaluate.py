@@ -162,8 +162,6 @@ def _evaluate(
     from armscan.evaluation import report_tables
     from armscan.evaluation.track import evaluate_and_track
     from armscan.experiment.console import print_result_table, print_where_to_look
-    from armscan.experiment.results import few_wrists
-    from armscan.training import TRAINING
     from armscan.utils.console import wide_console
 
     report, file = evaluate_and_track(prepared, store, n_episodes=n_episodes, seed=seed, changes=changes, out=out)
@@ -172,7 +170,7 @@ def _evaluate(
         console.print(part)
     tables = report.tables()
     for label, table in tables.items():
-        notes = [] if label == TRAINING else few_wrists({"": report.by_split[label]})
+        notes = report.notes(label)
         if label in prepared.own:
             notes.append("the agent's run has used some of these volumes, so this is no result on new wrists")
         print_result_table(label, table, notes, how=label == [*tables][-1], of=label)

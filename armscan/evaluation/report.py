@@ -12,9 +12,10 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 from rich.text import Text
 
+from armscan.experiment.results import few_subjects
 from armscan.stats.bootstrap import LEVEL, N_RESAMPLES, Estimate
 from armscan.tracking.sanitize import name_of
-from armscan.training import Evaluation, MetricEstimates, ResultTable
+from armscan.training import TRAINING, Evaluation, MetricEstimates, ResultTable
 from armscan.training.baselines import RANDOM
 from armscan.training.episode_results import metric_prefix
 from armscan.training.headline import ABOVE_RANDOM, beside_random, headline
@@ -82,6 +83,10 @@ class EvaluationReport:
             random = {AGENT: baselines[RANDOM]} if RANDOM in baselines else {}
             tables[label] = ResultTable({AGENT: figures, **baselines}, headline=headline({AGENT: figures}, random))
         return tables
+
+    def notes(self, label: str) -> list[str]:
+        """Return the notes on the results of some volumes, which do not repeat those of the whole evaluation."""
+        return [] if label == TRAINING else few_subjects({"": self.by_split[label]})
 
     def _with_total(self, evaluations: Mapping[str, Evaluation]) -> dict[str, Evaluation]:
         """Return evaluations by the name of their volumes, and the pooled one if there is a total."""

@@ -92,8 +92,11 @@ def evaluate_and_track(
         text = json.dumps(report.to_dict(), indent=1, allow_nan=False)
         atomic_write(file, text, follow_link=True)
         shown = own.with_suffix(".html")
-        tables = (f"<h2>{html.escape(label)}</h2>{table.html()}" for label, table in report.tables().items())
-        atomic_write(shown, page(tracked.name, "".join(tables), notes=prepared.notes))
+        sections = []
+        for label, table in report.tables().items():
+            notes = "".join(f"<p>Note: {note}.</p>" for note in report.notes(label))
+            sections.append(f"<h2>{html.escape(label)}</h2>{table.html()}{notes}")
+        atomic_write(shown, page(tracked.name, "".join(sections), notes=prepared.notes))
         tracked.log_files(file, shown)
     return report, file
 

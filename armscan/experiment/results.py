@@ -31,23 +31,20 @@ from armscan.utils.files import atomic_write
 from armscan.utils.run_files import BASELINES_FILE, EVALUATION_FILE, RESULTS_PAGE
 from armscan.utils.text import PERCENT, counted, formatted
 
-LAST_VALIDATION = "last validation"
+LAST_VALIDATION, BEST_VALIDATION = "last validation", "best validation"
 AGENT = "agent"
 TITLES = {
     TEST: "agent, test",
     VALIDATION: "agent, validation",
     LAST_VALIDATION: f"agent, {LAST_VALIDATION}",
+    BEST_VALIDATION: f"agent, {BEST_VALIDATION}",
     TRAINING: "agent, training",
 }
 # Every evaluation tracks this metric, below the name of its group; `NAMES` maps groups to the names of their volumes.
 EVALUATED = "/success_rate"
 # Of the metrics of a single volume in an evaluation.
 VOLUME_PREFIX = "volume/"
-NAMES = {metric_prefix(name): name for name in (TEST, TRAINING)} | {
-    "validation": LAST_VALIDATION,
-    "difference": "difference from the control",
-    "probability_of_improvement": "probability of improvement on the control",
-}
+NAMES = {metric_prefix(name): name for name in (TEST, TRAINING)} | {"validation": LAST_VALIDATION}
 MORE_HELP = "more subjects would help"
 WHAT_HELPS = (
     f"{MORE_HELP}: data.n_validation and data.n_test with phantoms; data=mixed or cross-validation "
@@ -198,10 +195,10 @@ def volume_notes(test: MetricEstimates, validation: MetricEstimates | None = Non
                 "the intervals do not overlap: volumes differ more than episodes do, and other wrists may lie anywhere "
                 f"between or outside; {WHAT_HELPS}"
             ]
-    return few_wrists({"test ": test} | ({"validation ": validation} if validation is not None else {}), WHAT_HELPS)
+    return few_subjects({"test ": test} | ({"validation ": validation} if validation is not None else {}), WHAT_HELPS)
 
 
-def few_wrists(figures: Mapping[str, MetricEstimates], helps: str = MORE_HELP) -> list[str]:
+def few_subjects(figures: Mapping[str, MetricEstimates], helps: str = MORE_HELP) -> list[str]:
     """Return a note if intervals come from too few subjects, as far as their number is known.
 
     Args:

@@ -15,7 +15,7 @@ from armscan.config.error_messages import one_line_message
 from armscan.errors import TrackingError
 from armscan.experiment.console import print_result_table
 from armscan.experiment.job import JobOutcome
-from armscan.experiment.results import few_wrists
+from armscan.experiment.results import few_subjects
 from armscan.launch.folds_table import AGENT, ALL_FOLDS, folds_table
 from armscan.launch.grid_plan import jobs_of
 from armscan.reports.html import page
@@ -122,4 +122,4 @@ def _pooled_folds(
     left_out = len(planned) - len(finished)
     missing = f"{left_out} of {len(planned)} jobs are missing: the table is over the folds that all seeds tested on"
     of_agent = next(each for title, each in table.results.items() if title.startswith("agent, "))
-    return table, [*([missing] if left_out else []), *few_wrists({"test ": of_agent})]
+    return table, [*([missing] if left_out else []), *few_subjects({"test ": of_agent})]

@@ -38,31 +38,34 @@ class Card:
     tags: dict[str, str]
 
     @classmethod
-    def of(cls, run: FoundRun, folder: Path) -> Self:
+    def of(cls, run: FoundRun, folder: Path, differs: str | None = None) -> Self:
         """Return the card of a run's policy, from its own evaluation and the latest `armscan evaluate` with a JSON.
 
         Args:
             run: Run to describe.
             folder: Folder for the downloaded files.
+            differs: How the policy differs from the agent that was evaluated. Default: None, it does not.
 
         Raises:
             TrackingError: If an evaluation cannot be read.
         """
         text = f"The policy of run `{run.run_id}`, {run.name}."
+        text += f"\n\nNote: this policy has not been evaluated; {differs}." if differs else ""
         reports = _reports(run, folder)
         if not reports:
             command = armscan_command("evaluate", run.run_id, tracking=run.uri, trust=run.needs_trust)
             text += f"\n\nNot evaluated yet: run `{command}`."
         tags: dict[str, str] = {}
         for title, report in reports.items():
-            notes = "".join(f"\n\nNote: {note}." for note in report.facts.get("notes", ()))
-            result = report.tables()[_label(report)].headline
+            label = _label(report)
+            notes = "".join(f"\n\nNote: {note}." for note in (*report.facts.get("notes", ()), *report.notes(label)))
+            result = report.tables()[label].headline
             section = f"\n\n### {title}\n\n{result}\n\n{_table(report).markdown()}{notes}"
             # If there is no room for both, the run's own evaluation stays.
             if len(text + section) <= MAX_CHARS:
                 text += section
-            # The run's own evaluation takes precedence: it was played by the run's rules.
-            tags = _tags(report) | tags
+            # Tags do not say by which rules an evaluation was played: all are of one, by the run's rules.
+            tags = tags or ({} if report.facts.get("changes") else _tags(report))
         return cls(text, tags)
 
 

@@ -92,7 +92,8 @@ def register_policy(tracking: str, run_id: str, name: str, *, trust: bool) -> st
         else:
             check_artifacts(run.client, run.experiment_id)
             export_policy(tracking, run_id, folder, trust=trust)
-        card = Card.of(run, Path(beside))
+        differs = (Model.load(str(folder)).metadata or {}).get("differs_from_agent")
+        card = Card.of(run, Path(beside), differs)
         if not is_kept:
             run.client.log_artifacts(run.run_id, str(folder), POLICY_FOLDER)
             for tag, value in tags_of_kept(folder).items():

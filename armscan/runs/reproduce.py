@@ -91,7 +91,9 @@ def differences(original: Original) -> list[str]:
         if tags.get(tag) != now.get(tag)
     ]
     if any(tags.get(tag) != now.get(tag) for tag in (DIFF_SUM, DIRTY)):
-        kept = f"; its {DIFF_FILE} is among its artifacts" if DIFF_SUM in tags else ""
+        kept = (
+            f"; its {DIFF_FILE} is among its artifacts" if DIFF_SUM in tags and DIFF_FILE in original.run.files else ""
+        )
         lines.append(f"changes since the commit {_changes(tags)}, and {_changes(now)} now{kept}")
     if "resumed" in tags:
         lines.append(f"the run was cut off and resumed {tags['resumed']} times, which changes no figure by itself")

@@ -7,17 +7,27 @@ from collections.abc import Collection
 from mlflow.entities import Run
 from rich.console import Console
 from rich.filesize import decimal
+from rich.markdown import Markdown
 from rich.text import Text
 
 from armscan.config.command_hints import armscan_command, resume_command
 from armscan.config.trust import TRUST, needs_trust
 from armscan.errors import in_one_line, printable
-from armscan.experiment.results import evaluation_table, figures_of, result_table
+from armscan.experiment.results import BEST_VALIDATION, LAST_VALIDATION, evaluation_table, figures_of, result_table
 from armscan.runs.rows import RunRow, artifacts_of
 from armscan.runs.run_folder import OwnFolder, RunSkippedError
 from armscan.runs.tables import format_duration, narrow_table
 from armscan.tracking import TrackingStore
-from armscan.tracking.tags import BEST_TAG, EVALUATED_TAG, FAILURE_TAG, PARENT_TAG
+from armscan.tracking.tags import (
+    AGENT_TAG,
+    BEST_TAG,
+    DESCRIPTION_TAG,
+    EVALUATED_TAG,
+    FAILURE_TAG,
+    PARENT_TAG,
+    STUDY_TAG,
+    TRIAL_TAG,
+)
 from armscan.utils.console import wide_console
 from armscan.utils.run_files import BEST_CHECKPOINT, ID_CHARS, LAST_CHECKPOINT
 
@@ -83,11 +93,19 @@ def _print_pairs(console: Console, title: str, pairs: dict[str, str], right: str
 
 
 def _print_figures(console: Console, run: Run) -> None:
-    """Print the final evaluations, the baselines and the last validation; not those of single volumes."""
-    metrics = run.data.metrics
-    table = evaluation_table(metrics) if EVALUATED_TAG in run.data.tags else result_table(figures_of(metrics))
+    """Print the final evaluations, the baselines and the last validation; of a study, its result."""
+    metrics, tags = run.data.metrics, run.data.tags
+    of_study = STUDY_TAG in tags and AGENT_TAG not in tags
+    if of_study and TRIAL_TAG not in tags and (result := tags.get(DESCRIPTION_TAG)):
+        console.print(Text("\nresult", style="bold"))
+        console.print(Markdown("\n".join(map(printable, result.splitlines()))))
+        return
+    figures = figures_of(metrics)
+    # A study and its trials track the best epoch, their trainings all of them.
+    named = {BEST_VALIDATION if of_study and name == LAST_VALIDATION else name: each for name, each in figures.items()}
+    table = evaluation_table(metrics) if EVALUATED_TAG in tags else result_table(named)
     if table.results:
-        best = run.data.tags.get(BEST_TAG)
+        best = tags.get(BEST_TAG)
         console.print(f"\nfigures{f' of its best job, {best[:ID_CHARS]}' if best else ''}", style="bold")
         for part in table.show(console.width):
             console.print(part)

@@ -217,6 +217,22 @@ def test_show_tells_everything_of_a_run(make_run, store, answer, tmp_path):
     assert re.search("^command +python -m armscan.run agent=sac", answer("show", run_id)[1], re.MULTILINE)
 
 
+def test_show_of_a_study_is_its_result_and_of_a_trial_its_best_epoch(make_run, answer):
+    figures = {"validation/success_rate": 0.75, "validation/seeds": 3.0, "probability_of_improvement/success_rate": 0.2}
+    result = "**Trial 2 is better.**\n\n| metric | chosen |\n| --- | --- |\n| steps, \x1b[2Jmean | 2.50 |"
+    shown = answer("show", make_run("study", figures=figures, tags={"study": "s", "mlflow.note.content": result}))[1]
+    assert "Trial 2 is better." in shown
+    assert "2.50" in shown
+    assert "\x1b[2J" not in shown
+    assert "75.0%" not in shown
+    shown = answer("show", make_run("trial 2", figures=figures, tags={"study": "s", "trial": "2"}))[1]
+    assert "best validation" in shown
+    assert re.search(r"seeds.*\b3\b", shown)
+    # A training within a trial tracks all of its epochs.
+    tags = {"study": "s", "trial": "2", "choice.agent": "sac"}
+    assert "last validation" in answer("show", make_run("seed 0", figures=figures, tags=tags))[1]
+
+
 def test_show_of_a_parent_offers_nothing_that_it_cannot_do(family, answer):
     printed = answer("show", family[0])[1]
     assert "folder: no folder was noted for it" in printed

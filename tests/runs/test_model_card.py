@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from armscan.agents.policy import SAMPLING
 from armscan.errors import TrackingError
 from armscan.evaluation import EvaluationReport
 from armscan.runs.model_card import Card
@@ -32,10 +33,10 @@ def keep(tmp_path, database):
     return kept
 
 
-def card_of(run_id, tmp_path):
+def card_of(run_id, tmp_path, differs=None):
     folder = tmp_path / "fetched"
     folder.mkdir(exist_ok=True)
-    return Card.of(load_run(f"sqlite:///{tmp_path}/mlruns.db", run_id), folder)
+    return Card.of(load_run(f"sqlite:///{tmp_path}/mlruns.db", run_id), folder, differs)
 
 
 def test_card_has_the_latest_evaluation_that_has_kept_its_figures(keep, tmp_path):
@@ -111,5 +112,19 @@ def test_card_pools_volumes_only_where_the_evaluation_did_and_has_its_notes(keep
     keep("figures.json", json.dumps(EvaluationReport(splits, has_total=has_total, facts=facts).to_dict()), run_id)
     card = card_of(run_id, tmp_path)
     assert ("all volumes" in card.text) == has_total
-    assert ("all_volumes/mean_steps" in card.tags) == has_total
+    # Its episodes have other rules, which a tag would not tell.
+    assert "all_volumes/mean_steps" not in card.tags
     assert "Note: the agent was trained on these volumes." in card.text
+    assert "Note: 1 subject, fewer than 8: the intervals are too narrow for other subjects" in card.text
+
+
+def test_tags_of_a_run_without_an_evaluation_of_its_own_are_those_of_the_latest_by_its_rules(keep, tmp_path):
+    run_id = keep("notes.txt", "")
+    keep("figures.json", json.dumps(BY_COMMAND | {"changes": {}}), run_id)
+    assert card_of(run_id, tmp_path).tags["test_volumes/mean_steps"] == "6"
+
+
+def test_card_of_a_policy_that_acts_otherwise_than_its_agent_says_so(keep, tmp_path):
+    run_id = keep("evaluation.json", json.dumps(OWN))
+    assert "not been evaluated" not in card_of(run_id, tmp_path).text
+    assert f"Note: this policy has not been evaluated; {SAMPLING}." in card_of(run_id, tmp_path, SAMPLING).text

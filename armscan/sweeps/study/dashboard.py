@@ -13,7 +13,9 @@ from armscan.config.services import MLFLOW_PORT
 from armscan.sweeps.scheduling.state import metrics_of_test
 from armscan.sweeps.storage.attribute_names import NOTE_SUM
 from armscan.tracking import TrackingStore
+from armscan.training.episode_results import TEST_METRICS
 from armscan.training.metric_display import COSTS, leading_among, title_of, value_text
+from armscan.training.metrics import SEEDS
 from armscan.utils.files import sha256
 from armscan.utils.log import log
 from armscan.utils.text import markdown_table
@@ -82,11 +84,11 @@ def shown_metrics(metrics: Mapping[str, float], n_seeds: int) -> dict[str, float
     return {f"{of}{title_of(name)}{statistic}": float(f"{chosen[name]:.4g}") for name in names}
 
 
-def named_as_of_runs(metrics: Mapping[str, float]) -> dict[str, float]:
+def named_as_of_runs(metrics: Mapping[str, float], n_seeds: int) -> dict[str, float]:
     """Return a trial's leading metrics by the names that runs use, so that MLflow shows them in the same columns."""
-    tested = metrics_of_test(metrics)
-    of_phases = {"validation": metrics, "test_volumes": tested}
-    return {f"{of}/{name}": each[name] for of, each in of_phases.items() for name in leading_among(each)}
+    of_phases = {"validation": metrics, TEST_METRICS: metrics_of_test(metrics)}
+    named = {f"{of}/{name}": each[name] for of, each in of_phases.items() for name in leading_among(each)}
+    return named | ({f"validation/{SEEDS}": float(n_seeds)} if n_seeds > 1 and metrics else {})
 
 
 def show_picture(trial: Trial, picture: Path, artifacts: Path) -> None:

@@ -194,7 +194,8 @@ class Worker:
             self._phase.remove_checkpoints(trial)
         if tracked is None:
             return
-        tracked.log_metrics(metrics | named_as_of_runs(metrics), n_env_steps=0)
+        named = named_as_of_runs(metrics, len(self._phase.seeds_of(trial)))
+        tracked.log_metrics(metrics | named, n_env_steps=0)
         if state == TrialState.PRUNED:
             tracked.set_pruned()
         tracked.end("FAILED" if reason else "FINISHED", reason=reason)
