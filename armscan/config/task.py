@@ -7,6 +7,8 @@ from collections.abc import Iterable, Mapping
 RULES = ("projection", "reward", "env")
 # What an agent sees of an episode: the task stays the same.
 SEEN = ("env.observation", "env.stack", "env.stack_exclude", "env.stack_memory", "env.memory", "env.flat")
+# Deformations of the training volumes alone.
+OF_TRAINING = tuple(f"env.transform.{name}" for name in ("scale", "stretch", "shear", "mirror"))
 # Keys of the data that leave the test volumes as they are.
 NOT_TESTED_ON = ("data.cache_dir", "data.n_training")
 
@@ -18,7 +20,9 @@ def is_under(key: str, sections: Iterable[str]) -> bool:
 
 def rules_in(params: Mapping[str, str]) -> dict[str, str]:
     """Return the parameters that make up the task of an episode, or how it is judged."""
-    return {key: value for key, value in params.items() if is_under(key, RULES) and not is_under(key, SEEN)}
+    return {
+        key: value for key, value in params.items() if is_under(key, RULES) and not is_under(key, (*SEEN, *OF_TRAINING))
+    }
 
 
 def have_same_task(params: Iterable[Mapping[str, str]]) -> bool:

@@ -7,11 +7,13 @@ import math
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from armscan.config.defaults import FOLD
 from armscan.config.error_messages import one_line_message
+from armscan.config.task import have_same_task
 from armscan.errors import TrackingError
 from armscan.experiment.console import print_result_table
 from armscan.experiment.job import JobOutcome
@@ -119,6 +121,9 @@ def _pooled_folds(
     table = folds_table(tested, len({job[FOLD] for job in planned}))
     if table is None:
         return None
+    if not have_same_task({key: value for key, value in run.data.params.items() if key != FOLD} for run in finished):
+        # The best of them would be the easiest.
+        table = replace(table, headline="")
     left_out = len(planned) - len(finished)
     missing = f"{left_out} of {len(planned)} jobs are missing: the table is over the folds that all seeds tested on"
     of_agent = next(each for title, each in table.results.items() if title.startswith("agent, "))

@@ -1,7 +1,9 @@
 """Cross-validation: the arguments of its grid, and the table over all folds."""
 
+import itertools
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 from hydra.errors import HydraException
@@ -13,7 +15,7 @@ from armscan.experiment.job import JobOutcome
 from armscan.launch.folds_grid import with_folds
 from armscan.launch.folds_table import AGENT, folds_table
 from armscan.launch.grid_plan import print_grid_plan
-from armscan.launch.grid_tables import keep_folds_table
+from armscan.launch.grid_tables import keep_folds_table, keep_tables
 from armscan.tracking.tags import DESCRIPTION_TAG
 from armscan.training import TEST, Evaluation, MetricEstimates
 from armscan.utils.run_files import RESULTS_PAGE
@@ -178,6 +180,21 @@ def test_page_and_description_of_all_folds_say_what_is_missing(tmp_path, databas
     assert "data.fold=1" in of_jobs
     assert "failed" in of_jobs
     assert store.get_run(run_id).data.tags[DESCRIPTION_TAG].startswith("1 of 2 jobs are missing\n\n")
+
+
+@pytest.mark.parametrize(("key", "values"), [("agent", ("sac", "ppo")), ("projection", ("y", "zy"))])
+def test_folds_of_different_tasks_have_no_best(tmp_path, database, capsys, key, values):
+    store, experiment_id = store_in(tmp_path, "a")
+    run_id = store.create_run(experiment_id, name="grid", tags={}).info.run_id
+    outcomes, runs = {}, []
+    for number, (value, fold) in enumerate(itertools.product(values, ("0", "1"))):
+        folder = left_by_a_run(tmp_path / str(number), f"wrist{fold}", [1.0])
+        outcomes[str(number)] = JobOutcome("", f"data.fold={fold} {key}={value}", metrics={})
+        of_run = {"tags": {"job": str(number), "folder": str(folder)}, "params": {key: value, "data.fold": fold}}
+        runs.append(SimpleNamespace(data=SimpleNamespace(**of_run)))
+    parent = {"overrides": ["data.fold=0,1", f"{key}={','.join(values)}"], "common": [], "run_id": run_id}
+    keep_tables(jobs_table(outcomes, {}, have_same_task=False), tmp_path, parent, outcomes, runs, store)
+    assert ("best of 2" in capsys.readouterr().out) == (key == "agent")
 
 
 @pytest.mark.parametrize(
