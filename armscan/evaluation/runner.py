@@ -10,6 +10,7 @@ from armscan.agents import Agent, Learner
 from armscan.anatomy import USUAL_PIXEL_MM
 from armscan.anatomy.tissues import MAX_METRIC_PIXEL_MM
 from armscan.config.command_hints import resume_command
+from armscan.config.defaults import to_plain
 from armscan.envs import EnvFactory
 from armscan.errors import CheckpointError, InvalidValueError, OptimalPlaneError, listed, printable, reason_of
 from armscan.evaluation.agent_source import EvaluatedAgent
@@ -152,7 +153,11 @@ def prepare_on_volumes(
         envs[label] = _env(env_factory, volumes, config.env.clustering, render_mode)
         here = TrainingDomain.of(envs[label])
         if source.domain is not None:
-            notes += [f"{label}: {difference}" for difference in source.domain.differences(here)]
+            rules = to_plain(source.config.env)
+            found = source.domain.differences(
+                here, rules["observation"], is_bounded=rules["translation_bounds_mm"] is not None
+            )
+            notes += [f"{label}: {difference}" for difference in found]
         # If a run has no training domain, the groups of volumes must at least match each other.
         trained = trained or here
         trained.check_observed(here)

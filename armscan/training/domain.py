@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Self
 
@@ -85,17 +85,32 @@ class TrainingDomain:
                     "images of one shape, and obs=cluster none"
                 )
 
-    def differences(self, other: TrainingDomain) -> list[str]:
-        """Return the differences that an agent meets on other volumes, one sentence each."""
+    def differences(self, other: TrainingDomain, observation: Any, *, is_bounded: bool) -> list[str]:
+        """Return the differences that an agent meets on other volumes, one sentence each.
+
+        Args:
+            other: Domain of the other volumes.
+            observation: Configuration of its observation, as plain dictionaries and lists, or a name.
+            is_bounded: Whether the configuration bounds translations, which are then the same in mm everywhere.
+        """
+        parts = [*_parts(_spelled_out(observation))]
+        images = [part for part in parts if "crop" in part]
+        compared: list[tuple[str, Sequence[Range], Sequence[Range], str, str, str]] = []
+        if images or any(part.get("normalised") is False for part in parts):
+            means = "images and plain cluster numbers have another scale"
+            compared.append(("a pixel", self.pixel_mm, other.pixel_mm, "in depth", "mm", means))
+        if any(part["crop"] is None for part in images):
+            cropped = [(min(here, trained),) * 2 for here, trained in zip(other.slice_px, self.slice_px, strict=True)]
+            trained = [(px, px) for px in self.slice_px]
+            compared.append(("an image", trained, cropped, "in depth", "pixels", "it is stretched to the same shape"))
+        if not is_bounded:
+            means = "the same normalised translation is another distance in mm"
+            compared.append(("a volume", self.size_mm, other.size_mm, "along the arm", "mm", means))
         notes = []
-        for what, here, there, means in (
-            ("a pixel", self.pixel_mm, other.pixel_mm, "images and plain cluster numbers have another scale"),
-            ("a volume", self.size_mm, other.size_mm, "the same normalised translation is another distance in mm"),
-        ):
-            axes = ("across", "in depth" if what == "a pixel" else "along the arm")
+        for what, here, there, axis, unit, means in compared:
             unusual = [
-                f"{_shown(seen)} mm {axis} (trained on {_shown(known)})"
-                for axis, known, seen in zip(axes, here, there, strict=True)
+                f"{_shown(seen)} {unit} {axis} (trained on {_shown(known)})"
+                for axis, known, seen in zip(("across", axis), here, there, strict=True)
                 if seen[0] < known[0] * (1 - USUAL_DIFFERENCE) or seen[1] > known[1] * (1 + USUAL_DIFFERENCE)
             ]
             if unusual:
@@ -112,8 +127,8 @@ def with_crops(rules: Any, trained: tuple[int, int], here: tuple[int, int]) -> A
     """Return the configuration of an observation with images cropped as in an agent's training.
 
     Without a crop in the configuration, images are cropped to the largest shape that fits into the slices of the
-    environment's volumes, which differs between data sets. Images that are resized to one shape keep that rule if
-    slices are smaller.
+    environment's volumes, which differs between data sets. Images that are resized to one shape are cropped to the
+    slices where these are smaller.
 
     Args:
         rules: Configuration as plain dictionaries and lists, or the name of an observation.
@@ -138,6 +153,15 @@ def _spelled_out(rules: Any) -> Any:
     return rules
 
 
+def _parts(rules: Any) -> Iterator[dict[str, Any]]:
+    """Yield the configuration of each single observation that is written out."""
+    if isinstance(rules, list):
+        for each in rules:
+            yield from _parts(each)
+    elif isinstance(rules, dict):
+        yield from _parts(rules["observations"]) if "observations" in rules else [rules]
+
+
 def _cropped(rules: Any, trained: tuple[int, int], here: tuple[int, int]) -> Any:
     if isinstance(rules, list):
         return [_cropped(each, trained, here) for each in rules]
@@ -146,15 +170,13 @@ def _cropped(rules: Any, trained: tuple[int, int], here: tuple[int, int]) -> Any
     changed = {name: _cropped(each, trained, here) for name, each in rules.items()}
     if not {"crop", "shape"} <= rules.keys() or rules["crop"] is not None:
         return changed
-    if trained[0] <= here[0] and trained[1] <= here[1]:
-        return changed | {"crop": list(trained)}
-    if rules["shape"] is None:
+    if rules["shape"] is None and (here[0] < trained[0] or here[1] < trained[1]):
         raise InvalidValueError(
             f"the agent was trained on images of {trained[0]} x {trained[1]} pixels (across, depth), but slices of "
             f"these volumes have {here[0]} x {here[1]}: it cannot be applied to them; an agent trained with "
             "obs.shape=[ACROSS,DEPTH] takes slices of every size"
         )
-    return changed
+    return changed | {"crop": [min(each) for each in zip(trained, here, strict=True)]}
 
 
 def _range(values: Iterable[float]) -> Range:

@@ -37,7 +37,7 @@ def test_evaluate_gives_the_same_figures_again(evaluate, tmp_path):
 
 
 def test_agent_is_applied_to_volumes_of_other_sizes_and_spacing(evaluate, tmp_path, coarse_folder):
-    run_id = tracked(tmp_path, "reward=agreement", "env.clustering=metric")
+    run_id = tracked(tmp_path, "reward=agreement", "env.clustering=metric", "obs.normalised=false")
     code, printed, errors = evaluate(run_id, f"--data={coarse_folder}", "--episodes=3")
     assert (code, errors) == (0, "")
     assert "note: train split: a pixel is 0.4 mm across (trained on 0.27)" in printed

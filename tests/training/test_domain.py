@@ -1,5 +1,7 @@
 """The record of an agent's training volumes, compared with other volumes."""
 
+from dataclasses import replace
+
 import pytest
 
 from armscan.envs import SliceObservation, make_armscan_env
@@ -28,9 +30,27 @@ def test_check_observed_says_which_part_has_another_shape(phantom):
 def test_differences_name_sizes_that_are_unusual(phantom):
     domain = TrainingDomain.of(make_armscan_env([phantom]))
     other = TrainingDomain({"vector": (14,)}, (100, 40), ((0.5, 0.5), (0.5, 0.5)), ((90.0, 95.0), (300.0, 900.0)))
-    assert domain.differences(domain) == []
-    assert any("0.5 mm across" in note and "scale" in note for note in domain.differences(other))
-    assert any("300 to 900 mm along the arm" in note for note in domain.differences(other))
+    raw = {"_target_": "armscan.envs.ClusterObservation", "normalised": False}
+    assert domain.differences(domain, raw, is_bounded=False) == []
+    pixel, size = domain.differences(other, ["action_reward", raw], is_bounded=False)
+    assert "0.5 mm across" in pixel
+    assert "scale" in pixel
+    assert "300 to 900 mm along the arm" in size
+    # Bounds, and observations in mm, are the same everywhere.
+    assert domain.differences(other, ["cluster", "slice_metric"], is_bounded=True) == []
+
+
+def test_images_that_are_stretched_are_named(phantom):
+    domain = TrainingDomain.of(make_armscan_env([phantom]))
+    across, depth = domain.slice_px
+    flat = replace(domain, slice_px=(across + 9, depth // 2))
+    rules = {"crop": None, "shape": [48, 36]}
+    told = f"an image is {depth // 2} pixels in depth (trained on {depth}): it is stretched to the same shape"
+    assert domain.differences(flat, rules, is_bounded=True) == [told]
+    assert domain.differences(flat, rules | {"crop": [9, 9]}, is_bounded=True) == []
+    assert domain.differences(flat, "cluster", is_bounded=True) == []
+    # Only where slices are smaller.
+    assert with_crops(rules, domain.slice_px, flat.slice_px)["crop"] == [across, depth // 2]
 
 
 def test_images_are_cropped_as_in_training():
@@ -44,4 +64,4 @@ def test_images_are_cropped_as_in_training():
     assert named == {"_target_": "armscan.envs.SliceObservation", "crop": [30, 20], "shape": None}
     with pytest.raises(InvalidValueError, match=r"trained on images of 30 x 20 pixels .* 29 x 40"):
         with_crops(rules, (30, 20), (29, 40))
-    assert with_crops({"crop": None, "shape": [5, 5]}, (30, 20), (29, 40)) == {"crop": None, "shape": [5, 5]}
+    assert with_crops({"crop": None, "shape": [5, 5]}, (30, 20), (29, 40)) == {"crop": [29, 20], "shape": [5, 5]}
