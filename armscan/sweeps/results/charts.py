@@ -58,6 +58,7 @@ def charts_of(
     if len(objectives) in (2, 3):
         figure = plot_pareto_front(study, target_names=list(map(title_of, objectives)))
         said = "Red: trials that no other is better than. Blue: the other trials that have run to their end."
+        said += "" if all(map(is_feasible, complete)) else " Grey: trials that violate a constraint."
         yield _titled("Pareto front", figure.update_layout(height=HEIGHT_PX), said)
     for number, (objective, direction) in enumerate(zip(objectives, study.directions, strict=True)):
         title = html.escape(title_of(objective))
@@ -67,11 +68,14 @@ def charts_of(
             yield _titled(f"Importance of each key: {title}", _importance(rows), _on_importance(len(complete)))
         keys = list(dict.fromkeys(key for trial in complete for key in trial.params))
         drawn = "".join(chart(_slice(complete, key, number, objective)) for key in keys)
-        yield f'<h2>Slices of the space: {title}</h2><div class="charts">{drawn}</div>'
+        violating = "" if all(map(is_feasible, complete)) else "trials violate a constraint."
+        said = f"<p>Grey {violating}</p>" if violating else ""
+        yield f'<h2>Slices of the space: {title}</h2>{said}<div class="charts">{drawn}</div>'
         figure = plot_parallel_coordinate(_alone(complete, number, direction), target_name=title_of(objective))
         # The scale ends in white.
         figure.update_layout(height=HEIGHT_PX, plot_bgcolor="#d0d0d0")
-        yield f"<h2>Parallel coordinates: {title}</h2><p>Darker is better.</p>{chart(figure, is_wide=True)}"
+        said = f"Darker is better.{f' Dotted {violating}' if violating else ''}"
+        yield f"<h2>Parallel coordinates: {title}</h2><p>{said}</p>{chart(figure, is_wide=True)}"
 
 
 def _on_importance(n_trials: int) -> str:
@@ -86,7 +90,12 @@ def _alone(trials: Sequence[FrozenTrial], number: int, direction: StudyDirection
     """Return a study with one of the objectives: of a target function, Optuna does not know the direction."""
     study = optuna.create_study(direction=direction)
     study.add_trials(
-        optuna.create_trial(value=trial.values[number], params=trial.params, distributions=trial.distributions)
+        optuna.create_trial(
+            value=trial.values[number],
+            params=trial.params,
+            distributions=trial.distributions,
+            constraints=trial.constraints,
+        )
         for trial in trials
     )
     return study
@@ -155,7 +164,8 @@ def _slice(trials: Sequence[FrozenTrial], key: str, number: int, objective: str)
     is_choice = isinstance(found, CategoricalDistribution)
     places = [str(trial.params[key]) if is_choice else trial.params[key] for trial in having]
     hover = _hover(having)
-    points = {"mode": "markers", "marker": {"color": BLUE, "size": 7, "opacity": 0.5}}
+    colours = [BLUE if is_feasible(trial) else GREY for trial in having]
+    points = {"mode": "markers", "marker": {"color": colours, "size": 7, "opacity": 0.5}}
     figure = Figure(Scatter(x=places, y=[_value(number)(trial) for trial in having], **points, **hover))
     return figure.update_layout(height=SMALL_PX, xaxis=key_axis(key, found), yaxis=_axis(objective))
 

@@ -139,7 +139,10 @@ def final_line(settings: StudySettings, final: FinalEvaluation, n_done: Sequence
 def status_line(opened: OpenedStudy, state: StudyState) -> str:
     """Return the state of a study in one line."""
     settings = opened.settings
-    done = f"{len(state.finished)} of {settings.n_trials} trials done, {state.n_pruned} of them pruned"
+    n_done = len(state.finished)
+    # Another command may have asked for more.
+    of_all = f" of {settings.n_trials}" if n_done <= settings.n_trials else ""
+    done = f"{n_done}{of_all} trials done, {state.n_pruned} of them pruned"
     parts = [
         f"study {settings.name}: {done}",
         f"{len(state.running)} running, {len(state.failed)} failed, {len(state.retried)} retried",

@@ -25,7 +25,6 @@ from armscan.training.metric_display import is_rate, title_of, value_text
 from armscan.utils.text import counted
 
 ROW_PX, AROUND_PX = 44, 110
-# Metrics of the length of an episode.
 
 
 class Candidate(NamedTuple):
@@ -35,7 +34,7 @@ class Candidate(NamedTuple):
         number: Number of its trial, or `CONTROL`.
         scores: The objective on the validation volumes by seed, NaN for a training that failed.
         estimate: Its mean with the 95 % interval by which candidates are compared.
-        n_seeds: Number of seeds that the estimate is over.
+        n_seeds: Number of seeds that the estimate is over; before there is one, of those that have a score.
         outcome: Outcome of the race: `chosen`, `failed`, `violates a constraint`, `not chosen`, or `in the race`.
         settings: Its values as overrides.
     """
@@ -60,7 +59,7 @@ class Candidate(NamedTuple):
             "candidate": self.name,
             "seeds": str(self.n_seeds),
             title_of(objective): value if is_known else "",
-            "95 % interval": f"{low} to {high}" if math.isfinite(self.estimate.low) else "",
+            "95 % interval": f"{low} to {high}" if self.estimate.low < self.estimate.high else "",
             "outcome": self.outcome,
         }
 
@@ -85,7 +84,7 @@ def candidates_of(final: FinalEvaluation) -> list[Candidate]:
                 number,
                 {seed: sign * score for seed, score in sorted(scores.items())},
                 estimate.clipped(*bounds_in(final.search, objective_of(final))),
-                standing.n_seeds,
+                standing.n_seeds or sum(map(math.isfinite, scores.values())),
                 _outcome(race, number),
                 " ".join(overrides_of(settings_of(searched, number))),
             )
@@ -137,7 +136,7 @@ def decision_section(
     n_candidates = max(0, len(candidates) - 1)
     n_seeds = counted(settings.min_seeds, "seed")
     further = (
-        "Further seeds went, in rounds, to the candidates where they most increase the probability of a correct "
+        "Further seeds go, in rounds, to the candidates where they most increase the probability of a correct "
         f"selection. The race ends at {settings.mean_seeds} seeds of each on average, or as soon as the leader is "
         f"ahead of all others (one-sided t tests at {100 * END_LEVEL:.0f} %). "
     )
@@ -146,7 +145,7 @@ def decision_section(
         f"are its best different configurations ({n_candidates}), and the control: {NOTHING_SEARCHED}.",
         f"<b>Selection</b>, on the validation volumes: {counted(n_selected, 'training')} with seeds that the search "
         f"has not used, compared by {html.escape(title_of(objective))} ({better} is better). Each "
-        f"candidate got {n_seeds}. "
+        f"candidate gets {n_seeds} first. "
         f"{further if settings.min_seeds < settings.mean_seeds else ''}"
         + (
             "The candidate whose interval has the best pessimistic end is chosen."

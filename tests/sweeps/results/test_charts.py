@@ -4,10 +4,12 @@ import html
 
 import optuna
 import pytest
+from optuna.distributions import FloatDistribution
 from optuna.study import StudyDirection
 from optuna.trial import create_trial
 
-from armscan.sweeps.results.charts import _history, charts_of
+from armscan.reports.chart_style import BLUE, GREY
+from armscan.sweeps.results.charts import _history, _slice, charts_of
 
 
 def test_best_so_far_is_of_trials_that_keep_all_constraints():
@@ -21,6 +23,20 @@ def test_best_so_far_is_of_trials_that_keep_all_constraints():
         "infeasible trial": [(1, 1.0)],
         "best so far": [(0, 3.0), (2, 2.0)],
     }
+
+
+def test_trials_that_violate_a_constraint_are_drawn_as_such():
+    study, space = optuna.create_study(), {"agent.lr": FloatDistribution(1e-4, 1e-2)}
+    for value, violation in ((3.0, -0.1), (1.0, 0.5)):
+        given = {"params": {"agent.lr": 1e-3}, "distributions": space, "constraints": {"training_s <= 60": violation}}
+        study.add_trial(create_trial(value=value, **given))
+    (slice_,) = _slice(study.trials, "agent.lr", 0, "mean_steps").data
+    assert slice_.marker.color == (BLUE, GREY)
+    for trials, is_said in ((study.trials, True), (study.trials[:1], False)):
+        shown = "".join(charts_of(study, trials, ["mean_steps"], []))
+        assert ("Grey trials violate a constraint." in shown) == is_said
+        assert ("Dotted trials violate a constraint." in shown) == is_said
+    assert '"dash":"dot"' in "".join(charts_of(study, study.trials, ["mean_steps"], []))
 
 
 @pytest.mark.parametrize(("n_objectives", "n_fronts"), [(1, 0), (2, 1), (3, 1), (4, 0)])
