@@ -15,6 +15,7 @@ from plotly.subplots import make_subplots
 from armscan.reports.chart_style import GREY, RATE_AXIS, line_mode
 from armscan.reports.curves import AXES, NOTHING, Curve
 from armscan.reports.groups import Group
+from armscan.reports.significance import evaluations_by_seed
 from armscan.stats.aggregation import MIN_SEEDS
 from armscan.stats.bootstrap import Estimate
 from armscan.training import MetricEstimates
@@ -161,7 +162,7 @@ def final_chart(
     titles = {limits.metric: limits.title} | {name: title_of(name) for name in FINAL}
     rows: list[tuple[str, str, MetricEstimates | None, dict[str, dict[str, float]]]] = []
     for group, colour, figures in zip(groups, colours(len(groups)), reached, strict=True):
-        of_seeds = {each.label: each.evaluation.metrics() for each in group.trainings if each.evaluation}
+        of_seeds = {f"seed {seed}": each.metrics() for seed, each in evaluations_by_seed(group).items()}
         rows.append((_wrapped(group.label), colour, figures, of_seeds))
     rows += [(_wrapped(name), GREY, figures, {}) for name, figures in baselines.items()]
     figure = make_subplots(rows=1, cols=len(titles), shared_yaxes=True, horizontal_spacing=0.04)

@@ -48,3 +48,12 @@ def test_metrics_have_the_intervals_that_the_table_shows():
     assert shown.low < shown.value == 1.0
     assert report.metrics()["volumes"]["success_rate_low"] == shown.low
     assert report.to_dict()["splits"]["volumes"]["figures"]["success_rate"] == shown._asdict()
+
+
+def test_times_are_those_of_the_agent_alone():
+    played = {"test volumes": evaluation_of(2, 4)}
+    contents = EvaluationReport(played, has_total=False, facts={}, baselines={"random": played}).to_dict()
+    of_agent, of_random = (
+        each["splits"]["test volumes"]["figures"] for each in (contents, contents["baselines"]["random"])
+    )
+    assert of_agent.keys() - of_random.keys() == {"mean_seconds_per_plane"}

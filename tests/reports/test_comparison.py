@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import pytest
 
+from armscan.reports.charts import final_chart
 from armscan.reports.comparison import write_comparison
-from armscan.reports.groups import group_trainings
+from armscan.reports.groups import Group, group_trainings
 from armscan.reports.significance import baseline_metrics, compare_groups, complement, final_metrics, have_same_volumes
 from armscan.stats.bootstrap import Estimate
 from armscan.training import Evaluation
@@ -257,3 +258,11 @@ def test_group_whose_seeds_were_tested_on_other_volumes_is_not_set_beside_random
     (alone,), _ = group_trainings([one])
     assert [have_same_volumes([group]) for group in (alone, mixed)] == [True, False]
     assert [len(each) for each in baseline_metrics([alone, mixed])] == [1, 0]
+
+
+def test_dots_of_a_cross_validation_are_its_seeds(make_training):
+    folds = [{"data.folds": "2", "data.fold": fold} for fold in ("0", "1")]
+    trainings = tuple(make_training(seed, params=fold, mean_steps=1 + seed) for seed in (0, 1) for fold in folds)
+    group = Group(1, "all", "1", trainings)
+    dots, *_ = final_chart([group], [final_metrics(group)], {}).data
+    assert list(dots.text) == ["seed 0", "seed 1"]
