@@ -56,4 +56,5 @@ def test_times_are_those_of_the_agent_alone():
     of_agent, of_random = (
         each["splits"]["test volumes"]["figures"] for each in (contents, contents["baselines"]["random"])
     )
-    assert of_agent.keys() - of_random.keys() == {"mean_seconds_per_plane"}
+    assert "mean_seconds_per_plane" in of_agent
+    assert "mean_seconds_per_plane" not in of_random
