@@ -205,6 +205,34 @@ def test_study_survives_a_killed_worker_and_hands_its_trials_back_when_it_is_int
 
 
 @pytest.mark.full
+@pytest.mark.usefixtures("database")
+def test_run_of_a_study_is_running_while_one_of_two_commands_works_and_killed_once_it_is_stopped(tmp_path):
+    words = [*TINY, "study.n_trials=2", "study.workers=1", "study.final_eval.top_k=0", "training.env_steps=200000"]
+
+    def of_study():
+        (run,) = [run for run in runs_in(tmp_path)[1] if run.info.run_name == "study sac_y"]
+        return run.info.status, run.data.tags.get("failure", "")
+
+    def report(n_trials):
+        return sum(bool(trial.intermediate_values) for trial in trials_of(tmp_path)) == n_trials
+
+    first = start_run(*words, cwd=tmp_path)
+    wait_until(lambda: report(1), process=first)
+    second = start_run(*words, cwd=tmp_path)
+    wait_until(lambda: report(2), process=second)
+    os.killpg(first.pid, signal.SIGINT)
+    assert first.wait(HANG_S) == 130
+    assert of_study() == ("RUNNING", "")
+    assert "not everything was uploaded" not in (tmp_path / "printed").read_text()
+    stop = [sys.executable, "-m", "armscan", "runs", "stop", "sac_y"]
+    subprocess.run(stop, cwd=tmp_path, check=True, stdout=subprocess.DEVNULL)
+    assert second.wait(HANG_S) == 0
+    status, reason = of_study()
+    assert status == "KILLED"
+    assert reason.startswith("stopped at ")
+
+
+@pytest.mark.full
 def test_interrupted_study_kills_a_worker_that_does_not_leave_and_enqueues_its_trial_again(tmp_path):
     words = [*TINY, "study.n_trials=2", "study.final_eval.top_k=0", "training.env_steps=200000"]
     process = start_run(*words, cwd=tmp_path)

@@ -196,17 +196,21 @@ def _start_or_resume(
         if found := _begun_in(before / folder.name, attempt, config):
             _take_over(found[1].info.run_id, before / folder.name, folder)
             break
-    if found is not None and (folder / LAST_CHECKPOINT).exists():
+    if found is not None:
         client, run = found
-        try:
-            earlier = resume_from_checkpoint(agent, folder, setup.provenance(run.info.run_id))
-        except CheckpointError:
-            # The trial can always start again, with an untrained agent.
-            setup = set_up(config)
-        else:
-            tags = {**volume_tags(setup), **place_tags(folder), **attempt.tags}
-            tags[PARENT_TAG] = attempt.run_id
-            return setup, TrackedRun.reopen(client, run, folder=folder, config=to_plain(config), tags=tags), earlier
+        tags = {**volume_tags(setup), **place_tags(folder), **attempt.tags, PARENT_TAG: attempt.run_id}
+        reopen = partial(TrackedRun.reopen, client, run, folder=folder, config=to_plain(config), tags=tags)
+        if (folder / LAST_CHECKPOINT).exists():
+            try:
+                earlier = resume_from_checkpoint(agent, folder, setup.provenance(run.info.run_id))
+            except CheckpointError:
+                # The trial can always start again, with an untrained agent.
+                setup = set_up(config)
+            else:
+                return setup, reopen(), earlier
+        elif not any(name.startswith("validation/") for name in run.data.metrics):
+            # It was interrupted before the end of its first epoch.
+            return setup, reopen(), begin_generation(attempt, setup, folder, run_id=run.info.run_id)
     job = Job(attempt.trial.number, " ".join(attempt.overrides), "", attempt.run_id, attempt.study_folder)
     invocation = Invocation(folder, attempt.overrides, attempt.command, choices, job)
     tracked = start_tracking(config, invocation, setup, tags=attempt.tags, retry_s=RETRY_S)

@@ -29,6 +29,7 @@ from armscan.sweeps.workers.monitor import StudyMonitor
 from armscan.sweeps.workers.supervisor import LAUNCHER_FILE, STOP_FILE, WORKER_FILES, keep_gpus, local_workers
 from armscan.tracking import TrackedRun, sync
 from armscan.tracking.run import SHORT_WAIT_S
+from armscan.tracking.sync import IN_USE
 from armscan.utils.console import print_sentence
 from armscan.utils.processes import ProcessInfo
 from armscan.utils.retry import no_retry
@@ -140,7 +141,7 @@ def _launch_elsewhere(monitor: StudyMonitor, folder: Path, launcher: str, launch
 @contextlib.contextmanager
 def _leaving(opened: OpenedStudy, folder: Path, tracked: TrackedRun, leave_s: float) -> Iterator[None]:
     """Return a context to launch the workers in, which leaves no worker and no open run behind."""
-    status, reason, is_asked = "FINISHED", None, False
+    status, reason, stopped, is_asked = "FINISHED", None, "", False
 
     def ask(*_: object) -> None:
         """Ask the workers to leave before an interrupted launcher may kill them; as a handler, take no lock."""
@@ -172,6 +173,7 @@ def _leaving(opened: OpenedStudy, folder: Path, tracked: TrackedRun, leave_s: fl
                 for trial in phase.scheduler.reclaim(LivenessCheck().is_dead):
                     phase.close_runs_of(trial)
                 reason = reason or phase.scheduler.failure_reason(phase.scheduler.state())
+                stopped = stopped or phase.scheduler.read_stop_request()
             judgement = judge(opened.final_eval) if opened.final_eval is not None else None
             metrics = best_metrics(opened.search.scheduler.study, judgement)
             tracked.log_metrics(metrics, n_env_steps=0, keeps_nan=True)
@@ -179,8 +181,10 @@ def _leaving(opened: OpenedStudy, folder: Path, tracked: TrackedRun, leave_s: fl
                 tracked.set_description(note)
                 where = opened.search.client, opened.search.experiment_id, opened.search.run_id, opened.folder
                 note_run(opened.search.scheduler.study, *where, note)
-        if reason is not None and status == "FINISHED":
+        if status == "FINISHED" and reason is not None:
             status = "FAILED"
+        elif status == "FINISHED" and stopped:
+            status, reason = "KILLED", f"stopped {stopped}"
         _upload(opened, tracked, "KILLED" if is_asked else status, reason)
         for each, handler in before.items():
             signal.signal(each, handler)
@@ -195,10 +199,13 @@ def _upload(opened: OpenedStudy, tracked: TrackedRun, status: str, reason: str |
     if is_there:
         # Trusted: anyone who may write into the folder of a study can execute code in it anyway.
         uploads = sync(opened.folder, lambda _: opened.search.client, trust=True)
-        left = [each.folder for each in uploads if each.left]
+        # Runs in use are those of another command, which uploads them.
+        left = [each.folder for each in uploads if each.left not in (None, IN_USE)]
         with contextlib.suppress(ArmscanError), no_retry():
             for phase in opened.phases:
                 phase.close_orphaned_runs()
+            if StudyMonitor(opened).is_alive():
+                opened.search.client.update_run(opened.search.run_id, status="RUNNING")
     if not is_there or left:
         print(
             f"not everything was uploaded: {armscan_command('runs', 'sync', str(opened.folder))} uploads the rest",
