@@ -6,10 +6,14 @@ from types import SimpleNamespace
 import pytest
 from omegaconf import OmegaConf
 
+from armscan.config.compose import compose_run
+from armscan.config.defaults import to_plain
+from armscan.experiment.build import set_up
 from armscan.sweeps.tasks import training
 from armscan.sweeps.tasks.attempt import over_seeds
-from armscan.sweeps.tasks.training import _begun_in
+from armscan.sweeps.tasks.training import _begun_in, _start_or_resume
 from armscan.tracking import open_store
+from tests.support import FEW_VOLUMES
 
 
 @pytest.mark.parametrize("interval", [None, (0, 400)], ids=["whole", "generation"])
@@ -42,6 +46,38 @@ def test_training_is_gone_on_with_if_this_study_has_begun_it(tmp_path, database,
     attempt = SimpleNamespace(run_id=this, tags={"study": "a"}, trial=SimpleNamespace(number=0))
     found = _begun_in(tmp_path, attempt, OmegaConf.create({"tracking": tracking, "seed": 0}))
     assert (found is not None and found[1].info.run_id == training) is is_ours
+
+
+@pytest.mark.usefixtures("database")
+def test_training_that_was_interrupted_before_its_first_epoch_goes_on_in_its_run(tmp_path):
+    config, choices = compose_run([*("sweep=sac_y", *FEW_VOLUMES), f"tracking.artifacts={tmp_path}/artifacts"])
+    setup = set_up(config)
+    client, experiment_id = open_store(**to_plain(config.tracking))
+    study = client.create_run(experiment_id, name="study", tags={"study": "a"}).info.run_id
+    tags = {"study": "a", "mlflow.parentRunId": study}
+    of_trial = client.create_run(experiment_id, name="trial", tags=tags).info.run_id
+    attempt = SimpleNamespace(
+        run_id=of_trial,
+        tags={"study": "a"},
+        trial=SimpleNamespace(number=0),
+        folders_before=(),
+        overrides=[],
+        command="",
+        study_folder=tmp_path,
+        parent_folder=None,
+    )
+    ids = []
+    for _ in range(2):
+        _, tracked, earlier = _start_or_resume(attempt, setup, config, choices, tmp_path)
+        assert earlier == []
+        tracked.end_requeued()
+        ids.append(tracked.run_id)
+    assert ids[0] == ids[1]
+    # A training whose checkpoint is gone would track its epochs twice.
+    client.log_metric(ids[0], "validation/mean_steps", 1.0)
+    _, tracked, _ = _start_or_resume(attempt, setup, config, choices, tmp_path)
+    tracked.end_requeued()
+    assert tracked.run_id != ids[0]
 
 
 def test_trial_reports_and_returns_the_same_figure_over_its_seeds():
