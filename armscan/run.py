@@ -24,13 +24,14 @@ from omegaconf import DictConfig
 from armscan.config.compose import application
 from armscan.config.credentials import check_words
 from armscan.config.defaults import MULTIRUN, PLAN, RESUME
-from armscan.config.error_messages import TRACEBACKS, print_mistake
+from armscan.config.error_messages import TRACEBACKS, one_line_message, print_mistake
 from armscan.config.sources import SWEEP
 from armscan.errors import is_interruption
 from armscan.experiment.job import INTERRUPTED, Invocation, check_choices, check_folder_stays, remove_if_untracked
 from armscan.launch.folds_grid import with_folds
 from armscan.launch.grid_plan import check_grid, print_grid_plan
 from armscan.launch.job_process import start_job
+from armscan.launch.launchers import ON_THIS_MACHINE, launcher_error
 from armscan.launch.multirun import Multirun, end_multirun, print_resume_command
 from armscan.utils.log import silence_libraries
 
@@ -79,7 +80,14 @@ def raise_or_exit(error: BaseException) -> NoReturn:
 def launch(words: Sequence[str]) -> None:
     """Run the command through Hydra, with these words as its arguments."""
     sys.argv[1:] = words
-    application(run)()
+    try:
+        application(run)()
+    except Exception as error:
+        launcher = Multirun.launcher
+        # Of a grid: studies report their launcher's errors themselves.
+        if launcher is None or launcher in ON_THIS_MACHINE or is_interruption(error) or one_line_message(error):
+            raise
+        raise launcher_error(launcher, error) from error
 
 
 def repeat_grid(words: Sequence[str], run_id: str, *, trust: bool) -> None:

@@ -7,7 +7,8 @@ import os
 import shutil
 from importlib.util import find_spec
 
-from armscan.errors import InvalidValueError
+from armscan.config.error_messages import one_line_message
+from armscan.errors import ArmscanError, InvalidValueError, reason_of
 
 LAUNCHER = "hydra/launcher"
 ON_THIS_MACHINE = ("basic", "joblib", "submitit_local")
@@ -33,6 +34,11 @@ def check_launcher(name: str) -> None:
         raise InvalidValueError(
             f"{LAUNCHER} is {name!r}, but this machine has no sbatch: start it where Slurm takes jobs"
         )
+
+
+def launcher_error(name: str, error: Exception) -> ArmscanError:
+    """Return what to report of any error of a launcher, which its libraries raise."""
+    return ArmscanError(f"{LAUNCHER} is {name!r}, which has failed: {one_line_message(error) or reason_of(error)}")
 
 
 def prepare_launcher(name: str) -> None:

@@ -51,6 +51,7 @@ class Multirun(Callback):
     """
 
     folder: Path | None = None
+    launcher: str | None = None
     # Of the parent run; open while the jobs run.
     outbox: Outbox | None = None
     # Run ID of the grid that this multirun repeats without its finished jobs, and whether they may build any class.
@@ -111,6 +112,7 @@ class Multirun(Callback):
         parent |= {"trust": is_told or untrusted_word(again, tracking["uri"]) is not None}
         (folder / PARENT_FILE).write_text(json.dumps(parent))
         Multirun.folder, Multirun.outbox = folder, begin_outbox(folder, run.info.run_id, tracking["uri"])
+        Multirun.launcher = launcher
 
 
 def _common(overrides: Sequence[str]) -> list[str]:

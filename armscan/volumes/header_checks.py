@@ -125,10 +125,11 @@ def check_metaimage(path: Path) -> None:
             f"{path}: the file is truncated or damaged: it holds {n_compressed} compressed bytes of voxels, but its "
             f"header promises {n_promised}"
         )
-    n_values = _whole(path, "ElementNumberOfChannels", fields.get("ElementNumberOfChannels", "1"))
+    if (n_values := fields.get("ElementNumberOfChannels", "1")) != "1":
+        raise VolumeError(f"{path}: ElementNumberOfChannels is {n_values}, but a labelmap has one value in each voxel")
     stored = StoredVoxels(
         file,
-        count_voxels(path, sizes) * METAIMAGE_TYPES[kind] * n_values,
+        count_voxels(path, sizes) * METAIMAGE_TYPES[kind],
         offset=offset,
         compression=GZIP_OR_ZLIB if is_compressed else None,
     )
@@ -158,8 +159,8 @@ def _fields(path: Path, header: bytes, separator: str) -> dict[str, str]:
     # SimpleITK takes some control characters for the end of a line or of the text.
     if re.search(r"[\0-\x08\x0b-\x1f\x7f]", text):
         raise VolumeError(f"{path}: the header is damaged: it contains bytes that are not text")
-    lines = [re.split(rf"\s*{separator}\s*", line.strip(), maxsplit=1) for line in text.split("\n")]
-    return {line[0]: line[1] for line in reversed(lines) if len(line) == 2}
+    lines = [re.split(separator, line, maxsplit=1) for line in text.split("\n")]
+    return {line[0].strip(): line[1].strip() for line in reversed(lines) if len(line) == 2}
 
 
 def _check_nrrd_spacing(path: Path, fields: dict[str, str]) -> None:

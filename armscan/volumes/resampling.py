@@ -8,12 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from armscan.errors import VolumeError
+from armscan.volumes.stored_voxels import MAX_VOXELS
 from armscan.volumes.volume import LabelVolume
 
 Spacing = tuple[float, float, float]
-
-# More than any scanner produces: a spacing that needs more is a mistake.
-MAX_VOXELS = 2**30
 
 
 def finest_spacing(volumes: Iterable[LabelVolume]) -> Spacing:

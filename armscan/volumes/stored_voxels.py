@@ -19,6 +19,8 @@ import numpy as np
 from armscan.errors import VolumeError
 
 PIECE_BYTES = 1 << 20
+# More than any scanner produces.
+MAX_VOXELS = 2**30
 # The highest compression ratio of deflate.
 MAX_RATIO = 1032
 # `wbits` of zlib for each format; a MetaImage's header does not say which of the two it uses.
@@ -108,10 +110,13 @@ def _check_length(path: Path, n_stored: int, n_promised: int) -> None:
 
 
 def count_voxels(path: Path, sizes: Sequence[int]) -> int:
-    """Return how many voxels an image of these sizes has; raise `VolumeError` if it has none."""
+    """Return how many voxels an image of these sizes has; raise `VolumeError` if it has none, or too many."""
     if min(sizes, default=0) < 1:
         raise VolumeError(f"{path}: the image has the size {tuple(sizes)}, but a labelmap must not be empty")
-    return math.prod(sizes)
+    # Few compressed bytes may hold more than the memory.
+    if (n_voxels := math.prod(sizes)) > MAX_VOXELS:
+        raise VolumeError(f"{path}: the image has {n_voxels} voxels, but a labelmap has at most {MAX_VOXELS}")
+    return n_voxels
 
 
 def check_spacing(path: Path, spacing: Sequence[float]) -> None:

@@ -1,6 +1,7 @@
 """Multiruns: the overrides that their jobs share, the address of their store, and their end."""
 
 import json
+import sys
 from dataclasses import asdict
 from unittest.mock import Mock
 
@@ -10,6 +11,8 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Quote, QuotedString
 
 from armscan import run
+from armscan.config.error_messages import one_line_message
+from armscan.errors import ArmscanError
 from armscan.experiment.job import INTERRUPTED, OUTCOME_FOLDER, PARENT_FILE, JobOutcome
 from armscan.launch.multirun import Multirun, _common, end_multirun
 from armscan.tracking import begin_outbox, sync
@@ -88,3 +91,22 @@ def test_override_of_all_jobs_is_recognised_however_hydra_spells_it():
     ((first, second),) = BasicSweeper.split_arguments(OverridesParser.create().parse_overrides(words), None)
     common = _common(words)
     assert [[word for word in job if word not in common] for job in (first, second)] == [["seed=3"], ["seed=4"]]
+
+
+@pytest.mark.parametrize(
+    ("launcher", "is_told"), [("ray", True), ("submitit_slurm", True), ("joblib", False), (None, False)]
+)
+def test_error_of_a_launcher_for_other_machines_is_one_line(monkeypatch, launcher, is_told):
+    def refuse(_):
+        def refused():
+            raise ConnectionError("Could not find any running Ray instance")
+
+        return refused
+
+    monkeypatch.setattr(run, "application", refuse)
+    monkeypatch.setattr(Multirun, "launcher", launcher)
+    with pytest.raises(ArmscanError if is_told else ConnectionError) as raised:
+        run.launch(sys.argv[1:])
+    if is_told:
+        line = f"hydra/launcher is {launcher!r}, which has failed: Could not find any running Ray instance"
+        assert one_line_message(raised.value) == line

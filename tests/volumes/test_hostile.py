@@ -14,7 +14,7 @@ from armscan.errors import ArmscanError, ManifestError, VolumeError
 from armscan.volumes import LabelVolume, open_dataset, read_volume
 from tests.conftest import make_tiny_volume
 
-HUGE = 1600
+HUGE, TOO_LARGE = 1000, 1100
 # Processor time, set generously: a late refusal takes half a minute or more, or all memory.
 MAX_SECONDS, MAX_BYTES = 15.0, 16 << 20
 MHA = (
@@ -94,6 +94,23 @@ DECLARED = {
 def test_a_small_file_that_declares_a_large_image_is_refused_at_once(refusal, name):
     # For NIfTI including the header.
     assert str(HUGE**3 + 352 * (".nii" in name)) in refusal(name, DECLARED[name], {"a.raw": SMALL})
+
+
+@pytest.mark.parametrize("name", ["a.nii", "a.mha", "a.nrrd"])
+def test_an_image_of_more_voxels_than_any_scanner_produces_is_refused(refusal, name):
+    # Its compressed voxels may be few bytes, and true.
+    contents = {"a.nii": nifti(TOO_LARGE), "a.mha": mha(TOO_LARGE, b""), "a.nrrd": nrrd(TOO_LARGE)}
+    assert f"the image has {TOO_LARGE**3} voxels, but a labelmap has at most {2**30}" in refusal(name, contents[name])
+
+
+def test_an_image_of_several_values_in_a_voxel_is_refused(refusal):
+    several = mha(10, bytes(3000)).replace(b"DimSize", b"ElementNumberOfChannels = 3\nDimSize")
+    assert "ElementNumberOfChannels is 3, but a labelmap has one value in each voxel" in refusal("a.mha", several)
+
+
+@pytest.mark.parametrize("name", ["a.mha", "a.nrrd"])
+def test_a_header_of_blanks_is_refused_at_once(refusal, name):
+    assert refusal(name, nrrd(2, more=f"a{' ' * 500_000}b") if name == "a.nrrd" else b"a" + b" " * 500_000 + b"b\n")
 
 
 BOMB = bytes(64 << 20)

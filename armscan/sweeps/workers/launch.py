@@ -14,10 +14,9 @@ from pathlib import Path
 
 from armscan.config.command_hints import armscan_command
 from armscan.config.defaults import TRACKING_URI
-from armscan.config.error_messages import one_line_message
 from armscan.config.sources import working_folder
-from armscan.errors import ArmscanError, StudyError, reason_of
-from armscan.launch.launchers import LAUNCHER, ON_THIS_MACHINE, prepare_launcher
+from armscan.errors import ArmscanError, reason_of
+from armscan.launch.launchers import ON_THIS_MACHINE, launcher_error, prepare_launcher
 from armscan.sweeps.results.judgement import best_metrics, judge, result_note
 from armscan.sweeps.results.progress import progress_display
 from armscan.sweeps.space.parameter import hydra_literal
@@ -53,7 +52,7 @@ def run_workers(opened: OpenedStudy, given: StudyCommand, launcher: str, launch:
 
     Raises:
         KeyboardInterrupt: If it is interrupted; the workers have been asked to leave.
-        StudyError: If the launcher has failed, and no worker is alive.
+        ArmscanError: If the launcher has failed, and no worker is alive.
     """
     started = f"{datetime.now():%Y-%m-%d_%H-%M-%S}_{socket.gethostname()}_{os.getpid()}"
     folder = working_folder() / opened.folder / "workers" / started
@@ -128,9 +127,7 @@ def _launch_elsewhere(monitor: StudyMonitor, folder: Path, launcher: str, launch
         print(f"error: {error}", file=sys.stderr)
     # Any error of a launcher, which may fail for one cancelled job while all others continue.
     except Exception as error:
-        failed = StudyError(
-            f"{LAUNCHER} is {launcher!r}, which has failed: {one_line_message(error) or reason_of(error)}"
-        )
+        failed = launcher_error(launcher, error)
         if not any(folder.glob(WORKER_FILES)):
             raise failed from error
         print(f"{failed}; waiting for workers that are still there", file=sys.stderr)
