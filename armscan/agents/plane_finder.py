@@ -63,7 +63,7 @@ class PlaneFinder(FinderParameters):
         if n_at_once > setup.total_env_steps:
             raise InvalidValueError(
                 f"agent.num_envs is {self.num_envs}, so the first gradient step takes {n_at_once} environment steps "
-                f"({self.n_looks} looks in each), but training.env_steps is {setup.total_env_steps}"
+                f"({self.n_looks} looks in each environment), but training.env_steps is {setup.total_env_steps}"
             )
 
 

@@ -11,6 +11,7 @@ from typing import Any
 # A configuration of an earlier version has this `env._target_`.
 OLD_ENV = "armscan.envs.EnvMaker"
 RENAMED_KEYS = {
+    "agent.astray_share": "agent.perturbed_share",
     "agent.entropy_coefficient": "agent.ent_coef",
     "agent.entropy_lr": "agent.ent_coef_lr",
     "agent.final_lr_share": "agent.lr_end_factor",
@@ -46,9 +47,11 @@ def migrate(config: Mapping[str, Any]) -> dict[str, Any]:
         config: Resolved configuration, nested or as leaves by their dotted keys. A configuration of this version is
             returned unchanged.
     """
-    env = config.get("env")
+    env, agent = config.get("env"), config.get("agent")
     target = env.get("_target_") if isinstance(env, Mapping) else config.get("env._target_")
-    return renamed(config) if target == OLD_ENV else dict(config)
+    # Renamed later than the environment.
+    is_between = "astray_share" in agent if isinstance(agent, Mapping) else "agent.astray_share" in config
+    return renamed(config) if target == OLD_ENV or is_between else dict(config)
 
 
 def rename_hint(key: str) -> str | None:

@@ -86,7 +86,7 @@ class EvaluationReport:
         return tables
 
     def notes(self, label: str) -> list[str]:
-        """Return the notes on the results of some volumes, which do not repeat those of the whole evaluation."""
+        """Return a note if a group of volumes has too few subjects; `facts` has the notes on the whole evaluation."""
         return [] if label == TRAINING else few_subjects({"": self.by_split[label]})
 
     def _with_total(self, evaluations: Mapping[str, Evaluation]) -> dict[str, Evaluation]:

@@ -52,7 +52,7 @@ class Card:
         text = f"The policy of run `{run.run_id}`, {run.name}."
         text += f"\n\nNote: this policy has not been evaluated; {differs}." if differs else ""
         reports = _reports(run, folder)
-        if not reports:
+        if not reports and not differs:
             command = armscan_command("evaluate", run.run_id, tracking=run.uri, trust=run.needs_trust)
             text += f"\n\nNot evaluated yet: run `{command}`."
         tags: dict[str, str] = {}
@@ -64,7 +64,7 @@ class Card:
             # If there is no room for both, the run's own evaluation stays.
             if len(text + section) <= MAX_CHARS:
                 text += section
-            # Tags do not say by which rules an evaluation was played: all are of one, by the run's rules.
+            # Tags cannot name changed rules, so all come from one evaluation that has changed none.
             tags = tags or ({} if report.facts.get("changes") else _tags(report))
         return cls(text, tags)
 

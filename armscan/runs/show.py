@@ -28,7 +28,9 @@ from armscan.tracking.tags import (
     STUDY_TAG,
     TRIAL_TAG,
 )
+from armscan.tracking.uploader import DESCRIPTION_SUM_TAG
 from armscan.utils.console import wide_console
+from armscan.utils.files import sha256
 from armscan.utils.run_files import BEST_CHECKPOINT, ID_CHARS, LAST_CHECKPOINT
 
 # Tags that say how a run was started; the first one that it has is shown.
@@ -96,12 +98,14 @@ def _print_figures(console: Console, run: Run) -> None:
     """Print the final evaluations, the baselines and the last validation; of a study, its result."""
     metrics, tags = run.data.metrics, run.data.tags
     of_study = STUDY_TAG in tags and AGENT_TAG not in tags
-    if of_study and TRIAL_TAG not in tags and (result := tags.get(DESCRIPTION_TAG)):
+    result = tags.get(DESCRIPTION_TAG, "")
+    is_ours = sha256(result.encode()) == tags.get(DESCRIPTION_SUM_TAG)
+    if of_study and TRIAL_TAG not in tags and is_ours:
         console.print(Text("\nresult", style="bold"))
         console.print(Markdown("\n".join(map(printable, result.splitlines()))))
         return
     figures = figures_of(metrics)
-    # A study and its trials track the best epoch, their trainings all of them.
+    # Runs of studies and trials have the best epoch, those of trainings end with the last.
     named = {BEST_VALIDATION if of_study and name == LAST_VALIDATION else name: each for name, each in figures.items()}
     table = evaluation_table(metrics) if EVALUATED_TAG in tags else result_table(named)
     if table.results:

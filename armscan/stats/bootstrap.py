@@ -40,6 +40,11 @@ class Estimate(NamedTuple):
     low: float
     high: float
 
+    @property
+    def has_width(self) -> bool:
+        """Whether it has an interval whose ends differ by more than rounding."""
+        return math.isfinite(self.low) and not math.isclose(self.low, self.high, rel_tol=1e-9, abs_tol=1e-12)
+
     @classmethod
     def around(cls, mean: Any, half_width: Any) -> Estimate:
         """Return a mean with a symmetric interval, which is NaN if `half_width` is."""

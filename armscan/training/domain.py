@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Self
 
@@ -20,6 +20,8 @@ from armscan.volumes import LabelVolume
 # Share by which a size may lie outside the range of the training volumes without a note.
 USUAL_DIFFERENCE = 0.1
 MAX_SHOWN_CHARS = 100
+# Observations that are the same for every size of pixels.
+IN_MM = ("ActionRewardObservation", "MetricSliceObservation")
 Range = tuple[float, float]
 
 
@@ -94,12 +96,11 @@ class TrainingDomain:
             is_bounded: Whether the configuration bounds translations, which are then the same in mm everywhere.
         """
         parts = [*_parts(_spelled_out(observation))]
-        images = [part for part in parts if "crop" in part]
         compared: list[tuple[str, Sequence[Range], Sequence[Range], str, str, str]] = []
-        if images or any(part.get("normalised") is False for part in parts):
+        if any(map(_is_in_pixels, parts)):
             means = "images and plain cluster numbers have another scale"
             compared.append(("a pixel", self.pixel_mm, other.pixel_mm, "in depth", "mm", means))
-        if any(part["crop"] is None for part in images):
+        if any(part.get("crop", 0) is None and part.get("shape") is not None for part in parts):
             cropped = [(min(here, trained),) * 2 for here, trained in zip(other.slice_px, self.slice_px, strict=True)]
             trained = [(px, px) for px in self.slice_px]
             compared.append(("an image", trained, cropped, "in depth", "pixels", "it is stretched to the same shape"))
@@ -127,8 +128,8 @@ def with_crops(rules: Any, trained: tuple[int, int], here: tuple[int, int]) -> A
     """Return the configuration of an observation with images cropped as in an agent's training.
 
     Without a crop in the configuration, images are cropped to the largest shape that fits into the slices of the
-    environment's volumes, which differs between data sets. Images that are resized to one shape are cropped to the
-    slices where these are smaller.
+    environment's volumes, which differs between data sets. Images that are resized to one shape are cropped, along
+    each axis, to the smaller of both.
 
     Args:
         rules: Configuration as plain dictionaries and lists, or the name of an observation.
@@ -160,6 +161,12 @@ def _parts(rules: Any) -> Iterator[dict[str, Any]]:
             yield from _parts(each)
     elif isinstance(rules, dict):
         yield from _parts(rules["observations"]) if "observations" in rules else [rules]
+
+
+def _is_in_pixels(part: Mapping[str, Any]) -> bool:
+    """Return whether what an observation shows depends on the size of pixels, as far as it is known."""
+    name = str(part.get("_target_")).rpartition(".")[2]
+    return name not in IN_MM and not (name == "ClusterObservation" and part.get("normalised", True))
 
 
 def _cropped(rules: Any, trained: tuple[int, int], here: tuple[int, int]) -> Any:

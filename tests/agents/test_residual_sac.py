@@ -149,7 +149,7 @@ def test_learner_stops_where_its_plane_finder_does(phantom):
         ({"pretraining_env_steps": 0}, "agent.pretraining_env_steps is 0"),
         (
             {"pretraining_env_steps": 3},
-            "takes 12 environment steps .3 looks in each., but agent.pretraining_env_steps is 3$",
+            "takes 12 environment steps .3 looks in each environment., but agent.pretraining_env_steps is 3$",
         ),
         ({"correction_mm": 0.0}, "agent.correction_mm is 0"),
         ({"sac": None}, "agent.sac is None"),

@@ -15,7 +15,7 @@ from armscan.config.legacy import INVERTED, RENAMED_KEYS, RENAMED_TARGETS, migra
 
 ARCHIVE = Path(__file__).parents[1] / "data" / "legacy" / "runs.tar.xz"
 FINISHED, KILLED = "e56cb34ab4c84623a846ab7cb28eda2b", "6f96be24381b433fabb756416f950769"
-AGENTS = ("sac", "ppo", "regression", "optuna")
+AGENTS = ("sac", "ppo", "regression", "optuna", "plane_finder")
 
 
 @pytest.fixture

@@ -10,6 +10,8 @@ import time
 import pytest
 
 from armscan.runs.tables import format_duration
+from armscan.tracking.uploader import DESCRIPTION_SUM_TAG
+from armscan.utils.files import sha256
 
 DAY_S = 86400.0
 
@@ -220,11 +222,15 @@ def test_show_tells_everything_of_a_run(make_run, store, answer, tmp_path):
 def test_show_of_a_study_is_its_result_and_of_a_trial_its_best_epoch(make_run, answer):
     figures = {"validation/success_rate": 0.75, "validation/seeds": 3.0, "probability_of_improvement/success_rate": 0.2}
     result = "**Trial 2 is better.**\n\n| metric | chosen |\n| --- | --- |\n| steps, \x1b[2Jmean | 2.50 |"
-    shown = answer("show", make_run("study", figures=figures, tags={"study": "s", "mlflow.note.content": result}))[1]
+    tags = {"study": "s", "mlflow.note.content": result, DESCRIPTION_SUM_TAG: sha256(result.encode())}
+    shown = answer("show", make_run("study", figures=figures, tags=tags))[1]
     assert "Trial 2 is better." in shown
     assert "2.50" in shown
     assert "\x1b[2J" not in shown
     assert "75.0%" not in shown
+    # A person's note is not the result.
+    tags = {"study": "s", "mlflow.note.content": "rerun this"}
+    assert "best validation" in answer("show", make_run("noted", figures=figures, tags=tags))[1]
     shown = answer("show", make_run("trial 2", figures=figures, tags={"study": "s", "trial": "2"}))[1]
     assert "best validation" in shown
     assert re.search(r"seeds.*\b3\b", shown)

@@ -24,7 +24,6 @@ from armscan.training.baselines import RANDOM
 from armscan.training.episode_results import subject_of_volumes
 from armscan.training.headline import beside_random
 from armscan.training.metric_display import bounds_of
-from armscan.training.metrics import COUNTS
 from armscan.training.result_table import with_baselines
 
 STEPS = ("mean_steps", "iqm_steps")
@@ -61,7 +60,7 @@ def final_results(trials: Sequence[FrozenTrial]) -> list[ConfigResult]:
     """Return the final evaluation of each configuration, over all episodes of all its trainings.
 
     The intervals resample seeds and subjects; all drawn seeds share the drawn subjects. Trials without
-    episodes have intervals from the means of seeds and volumes.
+    stored episodes have intervals from the means of seeds and subjects.
 
     Args:
         trials: Trials of the final evaluation; unfinished ones are left out.
@@ -103,16 +102,15 @@ def _of_means(trials: Sequence[FrozenTrial]) -> MetricEstimates:
     names = [name for name in of_seeds[0] if name.startswith(TEST_PREFIX) and not OF_VOLUME.fullmatch(name)]
     means = {name.removeprefix(TEST_PREFIX): _mean_of(name, of_seeds, subject_of) for name in names}
     volumes = {match[1] for name in common if (match := OF_VOLUME.fullmatch(name))}
-    episodes, solved = (sum(int(each.get(TEST_PREFIX + name, 0)) for each in of_seeds) for name in COUNTS[2:])
     n_subjects = len({subject_of.get(volume, volume) for volume in volumes})
-    return MetricEstimates(len(of_seeds), len(volumes), n_subjects, episodes, solved, means, limits_among(means))
+    return MetricEstimates(len(of_seeds), len(volumes), n_subjects, 0, 0, means, limits_among(means))
 
 
 def _mean_of(name: str, of_seeds: Sequence[Mapping[str, float]], subject_of: Mapping[str, str]) -> Estimate:
     volumes, scores = scores_of(name, of_seeds)
     found = mean_over_seeds(of_subjects(scores, [subject_of.get(volume, volume) for volume in volumes]))
     # Equal scores do not say how others would differ.
-    return Estimate(found.value, math.nan, math.nan) if found.low == found.high else found
+    return found if found.has_width else Estimate(found.value, math.nan, math.nan)
 
 
 def bounds_in(search: optuna.Study, metric: str) -> tuple[float, float]:

@@ -64,7 +64,7 @@ class Difference(NamedTuple):
     @property
     def is_constant(self) -> bool:
         """Whether all differences are equal up to rounding: then there is no interval."""
-        return math.isclose(self.paired.low, self.paired.high, rel_tol=1e-9, abs_tol=1e-12)
+        return math.isfinite(self.paired.low) and not self.paired.has_width
 
     @property
     def verdict(self) -> str:

@@ -59,7 +59,7 @@ class Candidate(NamedTuple):
             "candidate": self.name,
             "seeds": str(self.n_seeds),
             title_of(objective): value if is_known else "",
-            "95 % interval": f"{low} to {high}" if self.estimate.low < self.estimate.high else "",
+            "95 % interval": f"{low} to {high}" if self.estimate.has_width else "",
             "outcome": self.outcome,
         }
 
@@ -109,8 +109,8 @@ def selection_chart(candidates: Sequence[Candidate], objective: str) -> Figure:
     for each, label in zip(candidates, labels, strict=True):
         colour = ORANGE if each.outcome == "chosen" else BLUE if each.number == CONTROL else GREY
         settings = html.escape(each.settings or NOTHING_SEARCHED)
-        interval = f"{each.estimate.low:.4g} to {each.estimate.high:.4g}"
-        hover = f"%{{x:.4g}} ({interval})<br>{settings}<extra>{each.name}</extra>"
+        interval = f" ({each.estimate.low:.4g} to {each.estimate.high:.4g})" if each.estimate.has_width else ""
+        hover = f"%{{x:.4g}}{interval}<br>{settings}<extra>{each.name}</extra>"
         scores = {f"seed {seed}": score for seed, score in each.scores.items()}
         add_estimate(figure, label, colour, each.estimate, scores, hover, each.name)
     axis: dict[str, Any] = {"title": f"{title_of(objective)}, validation volumes"}
@@ -142,10 +142,10 @@ def decision_section(
     )
     steps = [
         f"<b>Search</b>: {counted(len(searched.finished), 'trial')}, {searched.n_pruned} of them pruned. Candidates "
-        f"are its best different configurations ({n_candidates}), and the control: {NOTHING_SEARCHED}.",
+        f"are its best different configurations ({n_candidates}); the control is {NOTHING_SEARCHED}.",
         f"<b>Selection</b>, on the validation volumes: {counted(n_selected, 'training')} with seeds that the search "
         f"has not used, compared by {html.escape(title_of(objective))} ({better} is better). Each "
-        f"candidate gets {n_seeds} first. "
+        f"candidate, and the control, gets {n_seeds} first. "
         f"{further if settings.min_seeds < settings.mean_seeds else ''}"
         + (
             "The candidate whose interval has the best pessimistic end is chosen."

@@ -93,7 +93,7 @@ class FinalEvaluation:
         return [CONTROL, *others[: self.settings.top_k]] if best and self.settings.top_k else []
 
     def scores(self) -> dict[int, dict[int, float]]:
-        """Return the score of each ended training of the selection, by candidate and seed; NaN if it failed."""
+        """Return the score of each ended training of the selection, by contender and seed; NaN if it failed."""
         scores: dict[int, dict[int, float]] = {number: {} for number in self.contenders()}
         for trial in self._counted_trials(self.selection):
             number, seed = training_of(trial)
@@ -116,12 +116,13 @@ class FinalEvaluation:
         scores, settings = self.scores() if scores is None else scores, self.settings
         run = partial(race, seeds=self.selection_seeds, min_seeds=settings.min_seeds)
         first_round, violated = set(self.selection_seeds[: settings.min_seeds]), self.violated()
-        gone = {number: of for number, of in scores.items() if number in violated and of.keys() >= first_round}
-        if not gone or len(gone) == len(scores):
+        violating = {number: of for number, of in scores.items() if number in violated and of.keys() >= first_round}
+        if not violating or len(violating) == len(scores):
             return run(scores, mean_seeds=settings.mean_seeds)
-        alone = run(gone, mean_seeds=settings.min_seeds).standings
+        alone = run(violating, mean_seeds=settings.min_seeds).standings
         withdrawn = {number: replace(standing, is_withdrawn=True) for number, standing in alone.items()}
-        found = run({number: scores[number] for number in scores if number not in gone}, mean_seeds=settings.mean_seeds)
+        others = {number: of for number, of in scores.items() if number not in violating}
+        found = run(others, mean_seeds=settings.mean_seeds)
         standings = {**withdrawn, **found.standings}
         return replace(found, standings={number: standings[number] for number in scores})
 

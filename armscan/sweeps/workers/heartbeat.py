@@ -26,8 +26,8 @@ DEAD_AFTER_S = 40.0
 # With up to this many running trials, each worker checks all of them at each heartbeat; with more it checks less often,
 # because a check costs the storage some time for each running trial.
 MAX_CHECKERS = 64
-# The most that the time between two checks adds to a worker's silence, in expected intervals: in a longer time, the
-# storage was unavailable to all workers, and none could renew its lease.
+# A gap between two checks counts as at most this many expected intervals of silence: in a longer gap, the storage was
+# unavailable to all workers, and none could renew its lease.
 MAX_UNSEEN = 1.5
 # Time in which a worker that leaves must requeue its trial. If the storage is unavailable for longer, the trial is
 # reclaimed later, because its process is gone.

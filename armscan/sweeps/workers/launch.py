@@ -20,6 +20,7 @@ from armscan.launch.launchers import ON_THIS_MACHINE, launcher_error, prepare_la
 from armscan.sweeps.results.judgement import best_metrics, judge, result_note
 from armscan.sweeps.results.progress import progress_display
 from armscan.sweeps.space.parameter import hydra_literal
+from armscan.sweeps.storage.attribute_names import NOTE_SUM
 from armscan.sweeps.study.arguments import DEFAULT_LAUNCHER, STORAGE, WORKER_KEY, StudyCommand, fixed_by
 from armscan.sweeps.study.dashboard import note_run
 from armscan.sweeps.study.phase import OpenedStudy
@@ -28,6 +29,7 @@ from armscan.sweeps.workers.monitor import StudyMonitor
 from armscan.sweeps.workers.supervisor import LAUNCHER_FILE, STOP_FILE, WORKER_FILES, keep_gpus, local_workers
 from armscan.tracking import TrackedRun, sync
 from armscan.tracking.run import SHORT_WAIT_S
+from armscan.tracking.store import store_errors
 from armscan.tracking.sync import IN_USE
 from armscan.utils.console import print_sentence
 from armscan.utils.processes import ProcessInfo
@@ -65,7 +67,7 @@ def run_workers(opened: OpenedStudy, given: StudyCommand, launcher: str, launch:
     tracked.resume()
     leave_s = LEAVE_S if launcher in ON_THIS_MACHINE else LEAVE_ELSEWHERE_S
     monitor = StudyMonitor(opened)
-    with _leaving(opened, folder, tracked, leave_s):
+    with _leaving(opened, folder, tracked, leave_s, monitor):
         if monitor.is_over():
             search = opened.search
             print_sentence(f"study {search.name} in {search.scheduler.storage.uri}: nothing is left to do")
@@ -136,7 +138,9 @@ def _launch_elsewhere(monitor: StudyMonitor, folder: Path, launcher: str, launch
 
 
 @contextlib.contextmanager
-def _leaving(opened: OpenedStudy, folder: Path, tracked: TrackedRun, leave_s: float) -> Iterator[None]:
+def _leaving(
+    opened: OpenedStudy, folder: Path, tracked: TrackedRun, leave_s: float, monitor: StudyMonitor
+) -> Iterator[None]:
     """Return a context to launch the workers in, which leaves no worker and no open run behind."""
     status, reason, stopped, is_asked = "FINISHED", None, "", False
 
@@ -172,24 +176,26 @@ def _leaving(opened: OpenedStudy, folder: Path, tracked: TrackedRun, leave_s: fl
                 reason = reason or phase.scheduler.failure_reason(phase.scheduler.state())
                 stopped = stopped or phase.scheduler.read_stop_request()
             judgement = judge(opened.final_eval) if opened.final_eval is not None else None
-            metrics = best_metrics(opened.search.scheduler.study, judgement)
-            tracked.log_metrics(metrics, n_env_steps=0, keeps_nan=True)
-            if note := result_note(judgement):
+            search, note = opened.search.scheduler.study, result_note(judgement)
+            # While a study that goes on has no new result, its run keeps all of the earlier one.
+            if note or NOTE_SUM not in search.user_attrs:
+                tracked.log_metrics(best_metrics(search, judgement), n_env_steps=0, keeps_nan=True)
+            if note:
                 tracked.set_description(note)
                 where = opened.search.client, opened.search.experiment_id, opened.search.run_id, opened.folder
-                note_run(opened.search.scheduler.study, *where, note)
+                note_run(search, *where, note)
         if status == "FINISHED" and reason is not None:
             status = "FAILED"
         elif status == "FINISHED" and stopped:
             status, reason = "KILLED", f"stopped {stopped}"
-        _upload(opened, tracked, "KILLED" if is_asked else status, reason)
+        _upload(opened, monitor, tracked, "KILLED" if is_asked else status, reason)
         for each, handler in before.items():
             signal.signal(each, handler)
     if is_asked:
         raise KeyboardInterrupt
 
 
-def _upload(opened: OpenedStudy, tracked: TrackedRun, status: str, reason: str | None) -> None:
+def _upload(opened: OpenedStudy, monitor: StudyMonitor, tracked: TrackedRun, status: str, reason: str | None) -> None:
     """End the study's own run, and upload what its trials buffered while their store was unavailable."""
     is_there = tracked.end(status, reason=reason, wait_s=SHORT_WAIT_S if status == "KILLED" else None)
     left = []
@@ -198,11 +204,12 @@ def _upload(opened: OpenedStudy, tracked: TrackedRun, status: str, reason: str |
         uploads = sync(opened.folder, lambda _: opened.search.client, trust=True)
         # Runs in use are those of another command, which uploads them.
         left = [each.folder for each in uploads if each.left not in (None, IN_USE)]
-        with contextlib.suppress(ArmscanError), no_retry():
+        client = opened.search.client
+        with contextlib.suppress(ArmscanError), no_retry(), store_errors(client.uri):
             for phase in opened.phases:
                 phase.close_orphaned_runs()
-            if StudyMonitor(opened).is_alive():
-                opened.search.client.update_run(opened.search.run_id, status="RUNNING")
+            if monitor.is_worked_on():
+                client.update_run(opened.search.run_id, status="RUNNING")
     if not is_there or left:
         print(
             f"not everything was uploaded: {armscan_command('runs', 'sync', str(opened.folder))} uploads the rest",

@@ -10,6 +10,8 @@ from collections import defaultdict
 from collections.abc import Iterator
 
 from armscan.errors import ArmscanError, StorageUnavailableError
+from armscan.sweeps.scheduling.state import BEAT_S
+from armscan.sweeps.storage.attribute_names import LEASE
 from armscan.sweeps.study.phase import OpenedStudy
 from armscan.sweeps.workers.heartbeat import LivenessCheck
 from armscan.utils.retry import no_retry
@@ -47,6 +49,12 @@ class StudyMonitor:
             for phase in self._opened.phases
             for trial in phase.scheduler.state().running
         )
+
+    def is_worked_on(self) -> bool:
+        """Return whether the worker of any running trial is alive and, by its clock, has renewed its lease lately."""
+        running = (trial for phase in self._opened.phases for trial in phase.scheduler.state().running)
+        beats_s = (trial.user_attrs.get(LEASE, {}).get(BEAT_S, 0.0) for trial in running)
+        return self.is_alive() and any(time.time() - beat_s < LIFELESS_S for beat_s in beats_s)
 
     def wait_until_over(self) -> bool:
         """Wait as long as any worker is alive; return whether the study is over then."""

@@ -21,7 +21,7 @@ def judged(number, metrics, state=TrialState.COMPLETE):
 
 
 def figures_of(of_volumes):
-    metrics = {"mean_steps": 1.0, "test/mean_steps": float(np.mean(of_volumes)), "test/success_rate": 1.0}
+    metrics = {"mean_steps": 1.0, "test/mean_steps": float(np.mean(of_volumes)), "test/success_rate": 0.7}
     return metrics | {f"test/volume/v{i}/mean_steps": value for i, value in enumerate(of_volumes)}
 
 
@@ -33,7 +33,7 @@ def test_verdict_is_over_seeds_and_test_volumes():
     mean, low, high = result.figures.estimates["mean_steps"]
     assert mean == pytest.approx(scores.mean())
     assert low < mean < high
-    assert result.figures.estimates["success_rate"].value == 1.0
+    assert result.figures.estimates["success_rate"].value == pytest.approx(0.7)
     # All scores are equal.
     assert np.isnan(result.figures.estimates["success_rate"][1:]).all()
 

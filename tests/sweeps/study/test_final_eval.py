@@ -122,7 +122,7 @@ def trained(study):
     return [training_of(trial) for trial in study.trials if trial.state == TrialState.COMPLETE]
 
 
-def test_test_volumes_are_opened_for_the_chosen_configuration_and_the_control_alone(
+def test_test_volumes_are_used_for_the_chosen_configuration_and_the_control_alone(
     storage_uri,
 ):
     final = run(storage_uri)
@@ -256,14 +256,14 @@ def test_control_that_is_the_best_is_the_result(storage_uri):
     assert judgement.differences == ()
 
 
-@pytest.mark.parametrize(("top_k", "candidates"), [(0, []), (1, [CONTROL, 1]), (2, [CONTROL, 1, 2])])
-def test_trial_with_the_settings_of_the_control_is_no_candidate_beside_it(storage_uri, top_k, candidates):
+@pytest.mark.parametrize(("top_k", "contenders"), [(0, []), (1, [CONTROL, 1]), (2, [CONTROL, 1, 2])])
+def test_trial_with_the_settings_of_the_control_is_no_candidate_beside_it(storage_uri, top_k, contenders):
     storage, asked, search = searched(storage_uri, top_k=top_k)
     # Neither a sampled trial nor one that was taken over is marked as having them.
     final = open_final_eval(storage, asked, search, search.trials[0].params)
-    assert final.contenders() == candidates
+    assert final.contenders() == contenders
     # As a report reads it.
-    assert stored_final_eval(open_storage(storage_uri), search).contenders() == candidates
+    assert stored_final_eval(open_storage(storage_uri), search).contenders() == contenders
 
 
 def test_training_that_failed_leaves_its_candidate_out_and_the_study_has_a_result(storage_uri):
@@ -294,7 +294,7 @@ def test_interval_of_steps_ends_at_the_longest_episode(storage_uri):
     assert candidates_of(final)[0].estimate.low >= 1.0
 
 
-def test_study_that_goes_on_says_for_whom_else_the_test_volumes_were_opened(storage_uri):
+def test_study_that_goes_on_says_for_whom_else_the_test_volumes_were_used(storage_uri):
     run(storage_uri)
     _, _, search = searched(storage_uri)
     trial = search.ask()
