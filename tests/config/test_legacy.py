@@ -145,3 +145,10 @@ def test_values_of_an_old_trial_are_given_by_their_new_names():
     from armscan.sweeps.space.parameter import overrides_of
 
     assert overrides_of({"agent.updates_per_env_step": 0.5, "agent.lr": 0.1}) == ["agent.utd_ratio=0.5", "agent.lr=0.1"]
+
+
+@pytest.mark.parametrize("config", [{"agent": {"astray_share": 0.2}}, {"agent.astray_share": 0.2}])
+def test_key_that_was_renamed_later_is_migrated_alone(config):
+    new = {"agent": {"perturbed_share": 0.2}} if "agent" in config else {"agent.perturbed_share": 0.2}
+    assert migrate(config) == new
+    assert migrate(new) == new

@@ -49,6 +49,10 @@ def test_images_that_are_stretched_are_named(phantom):
     assert domain.differences(flat, rules, is_bounded=True) == [told]
     assert domain.differences(flat, rules | {"crop": [9, 9]}, is_bounded=True) == []
     assert domain.differences(flat, "cluster", is_bounded=True) == []
+    # A class of the user's own may show pixels, but only armscan's are resized.
+    assert domain.differences(flat, {"_target_": "parts.Mine", "crop": None}, is_bounded=True) == []
+    coarse = replace(domain, pixel_mm=((0.5, 0.5), (0.5, 0.5)))
+    assert domain.differences(coarse, {"_target_": "parts.Mine"}, is_bounded=True)
     # Only where slices are smaller.
     assert with_crops(rules, domain.slice_px, flat.slice_px)["crop"] == [across, depth // 2]
 

@@ -11,7 +11,7 @@ from optuna.trial import TrialState
 from armscan.sweeps.scheduling.claim import PlannedTrial
 from armscan.sweeps.scheduling.limits import Limits
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.storage.attribute_names import FINAL_SEED, FINALIST, METRICS, STOP
+from armscan.sweeps.storage.attribute_names import FINAL_SEED, FINALIST, LEASE, METRICS, STOP
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.workers import monitor as module
 from armscan.sweeps.workers.monitor import StudyMonitor
@@ -75,6 +75,13 @@ def test_study_that_was_stopped_is_over_without_its_final_evaluation(watch):
     scheduler.study.tell(running, 1.0)
     scheduler.study.set_user_attr(STOP, "by me")
     assert monitor.is_over()
+
+
+@pytest.mark.parametrize(("age_s", "is_worked_on"), [(5.0, True), (600.0, False)])
+def test_study_is_worked_on_while_leases_are_renewed(watch, age_s, is_worked_on):
+    monitor, _, running = watch()
+    running.set_user_attr(LEASE, ELSEWHERE | {"beat": 1, "beat_s": time.time() - age_s})
+    assert monitor.is_worked_on() == is_worked_on
 
 
 def test_launcher_that_waits_for_nobody_is_interrupted_when_the_study_is_over(watch):
