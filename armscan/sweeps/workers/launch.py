@@ -142,7 +142,7 @@ def _leaving(
     opened: OpenedStudy, folder: Path, tracked: TrackedRun, leave_s: float, monitor: StudyMonitor
 ) -> Iterator[None]:
     """Return a context to launch the workers in, which leaves no worker and no open run behind."""
-    status, reason, stopped, is_asked = "FINISHED", None, "", False
+    status, is_asked = None, False
 
     def ask(*_: object) -> None:
         """Ask the workers to leave before an interrupted launcher may kill them; as a handler, take no lock."""
@@ -168,31 +168,37 @@ def _leaving(
             signal.signal(each, signal.SIG_IGN)
         (folder / STOP_FILE).touch()
         _end_workers(folder)
-        # If the storage is unavailable, the next start does it; if it is damaged, the result says so.
-        with contextlib.suppress(ArmscanError), no_retry():
-            for phase in opened.phases:
-                for trial in phase.scheduler.reclaim(LivenessCheck().is_dead):
-                    phase.close_runs_of(trial)
-                reason = reason or phase.scheduler.failure_reason(phase.scheduler.state())
-                stopped = stopped or phase.scheduler.read_stop_request()
-            judgement = judge(opened.final_eval) if opened.final_eval is not None else None
-            search, note = opened.search.scheduler.study, result_note(judgement)
-            # While a study that goes on has no new result, its run keeps all of the earlier one.
-            if note or NOTE_SUM not in search.user_attrs:
-                tracked.log_metrics(best_metrics(search, judgement), n_env_steps=0, keeps_nan=True)
-            if note:
-                tracked.set_description(note)
-                where = opened.search.client, opened.search.experiment_id, opened.search.run_id, opened.folder
-                note_run(search, *where, note)
-        if status == "FINISHED" and reason is not None:
-            status = "FAILED"
-        elif status == "FINISHED" and stopped:
-            status, reason = "KILLED", f"stopped {stopped}"
-        _upload(opened, monitor, tracked, "KILLED" if is_asked else status, reason)
+        ended, reason = _conclude(opened, tracked)
+        _upload(opened, monitor, tracked, "KILLED" if is_asked else status or ended, reason)
         for each, handler in before.items():
             signal.signal(each, handler)
     if is_asked:
         raise KeyboardInterrupt
+
+
+def _conclude(opened: OpenedStudy, tracked: TrackedRun) -> tuple[str, str | None]:
+    """Reclaim the trials of dead workers, and track the result; return the status of the study's run, and why."""
+    failure, stopped = None, ""
+    # If the storage is unavailable, the next start does it; if it is damaged, the result says so.
+    with contextlib.suppress(ArmscanError), no_retry():
+        for phase in opened.phases:
+            for trial in phase.scheduler.reclaim(LivenessCheck().is_dead):
+                phase.close_runs_of(trial)
+            failure = failure or phase.scheduler.failure_reason(phase.scheduler.state())
+            stopped = stopped or phase.scheduler.read_stop_request()
+        judgement = judge(opened.final_eval) if opened.final_eval is not None else None
+        search, note = opened.search.scheduler.study, result_note(judgement)
+        # While a study that goes on has no new result, its run keeps all of the earlier one.
+        if note or NOTE_SUM not in search.user_attrs:
+            tracked.log_metrics(best_metrics(search, judgement), n_env_steps=0, keeps_nan=True)
+        if note:
+            tracked.set_description(note)
+            note_run(
+                search, opened.search.client, opened.search.experiment_id, opened.search.run_id, opened.folder, note
+            )
+    if failure:
+        return "FAILED", failure
+    return ("KILLED", f"stopped {stopped}") if stopped else ("FINISHED", None)
 
 
 def _upload(opened: OpenedStudy, monitor: StudyMonitor, tracked: TrackedRun, status: str, reason: str | None) -> None:
