@@ -34,7 +34,7 @@ def test_network_is_chosen_from_the_observation(phantom, observation, rules, kin
 
 
 def test_mlp_refuses_images(phantom):
-    with pytest.raises(InvalidValueError, match=r"mlp, which takes one vector, but .* action, reward, slice; take net"):
+    with pytest.raises(InvalidValueError, match=r"mlp, which takes one vector, but .* action, reward, slice; set net"):
         MLP((8,)).for_space(space_of(phantom, "slice"))
 
 
