@@ -124,7 +124,7 @@ def _difference_rows(judgement: Judgement) -> Iterator[Row]:
             "chosen": key_of(judgement.chosen),
             "figure": f"{TEST_PREFIX}{each.metric}",
             "seeds": judgement.n_seeds,
-            **dict(zip(("difference", "low", "high"), each.paired, strict=True)),
+            **dict(zip(("difference", "low", "high"), each.estimate, strict=True)),
             **dict(zip(("probability", "probability_low", "probability_high"), each.probability, strict=True)),
         }
 

@@ -67,6 +67,11 @@ class Difference(NamedTuple):
         return math.isfinite(self.paired.low) and not self.paired.has_width
 
     @property
+    def estimate(self) -> Estimate:
+        """The mean difference, without an interval if all differences are equal."""
+        return Estimate(self.paired.value, math.nan, math.nan) if self.is_constant else self.paired
+
+    @property
     def verdict(self) -> str:
         """Return `better` or `worse` according to the interval; empty if it includes 0, or there is none."""
         above, below = ("better", "worse") if self.is_higher_better else ("worse", "better")
@@ -225,8 +230,8 @@ def judge(final: FinalEvaluation) -> Judgement | None:
 def best_metrics(search: optuna.Study, judgement: Judgement | None) -> dict[str, float]:
     """Return the leading metrics of a study's result, by the names that runs use; before it has one, of its best trial.
 
-    Metrics that an earlier call may have returned and that are not valid any more are NaN: MLflow cannot delete them.
-    The control has no validation metrics, and a study that went on after its end lacks differences of the earlier one.
+    Metrics that are not there are NaN, in place of those of an earlier result, which MLflow cannot delete: validation
+    metrics of the control, differences, and intervals.
 
     Args:
         search: Study of the search.
@@ -244,18 +249,11 @@ def best_metrics(search: optuna.Study, judgement: Judgement | None) -> dict[str,
     found |= _leading(TEST_METRICS, of_chosen)
     if (of_random := chosen.baselines.get(RANDOM)) is not None:
         found |= _leading(RANDOM, of_random.metrics())
-    if judgement.others:
-        compared = (*(name for name in search.user_attrs[OBJECTIVES] if name in of_chosen), *leading_among(of_chosen))
-        found |= dict.fromkeys(
-            (name for key in COMPARISONS for each in compared for name in _names(key, each)), math.nan
-        )
+    compared = (*(name for name in search.user_attrs[OBJECTIVES] if name in of_chosen), *leading_among(of_chosen))
+    found |= dict.fromkeys((name for key in COMPARISONS for each in compared for name in _names(key, each)), math.nan)
     for each in judgement.differences:
-        for key, estimate in zip(COMPARISONS, (each.paired, each.probability), strict=True):
-            found |= {
-                name: value
-                for name, value in zip(_names(key, each.metric), estimate, strict=True)
-                if not math.isnan(value)
-            }
+        for key, estimate in zip(COMPARISONS, (each.estimate, each.probability), strict=True):
+            found |= dict(zip(_names(key, each.metric), estimate, strict=True))
     return found
 
 

@@ -20,7 +20,6 @@ from armscan.launch.launchers import ON_THIS_MACHINE, launcher_error, prepare_la
 from armscan.sweeps.results.judgement import best_metrics, judge, result_note
 from armscan.sweeps.results.progress import progress_display
 from armscan.sweeps.space.parameter import hydra_literal
-from armscan.sweeps.storage.attribute_names import NOTE_SUM
 from armscan.sweeps.study.arguments import DEFAULT_LAUNCHER, STORAGE, WORKER_KEY, StudyCommand, fixed_by
 from armscan.sweeps.study.dashboard import note_run
 from armscan.sweeps.study.phase import OpenedStudy
@@ -186,10 +185,11 @@ def _conclude(opened: OpenedStudy, tracked: TrackedRun) -> tuple[str, str | None
                 phase.close_runs_of(trial)
             failure = failure or phase.scheduler.failure_reason(phase.scheduler.state())
             stopped = stopped or phase.scheduler.read_stop_request()
-        judgement = judge(opened.final_eval) if opened.final_eval is not None else None
-        search, note = opened.search.scheduler.study, result_note(judgement)
+        final, search = opened.final_eval, opened.search.scheduler.study
+        judgement = judge(final) if final is not None else None
+        note = result_note(judgement)
         # While a study that goes on has no new result, its run keeps all of the earlier one.
-        if note or NOTE_SUM not in search.user_attrs:
+        if note or final is None or not final.has_judged:
             tracked.log_metrics(best_metrics(search, judgement), n_env_steps=0, keeps_nan=True)
         if note:
             tracked.set_description(note)
