@@ -21,20 +21,22 @@ if TYPE_CHECKING:
 
 # Folder of pictures within the folder of the data.
 PICTURES = "labelling"
+LABELLED, UNLABELLED = "a labelled plane", "no labelled plane"
 # Names of files that are listed.
 N_LISTED = 8
 
 
 def print_dataset(dataset: Dataset, folder: Path) -> None:
     """Print a table for each volume, and the excluded volumes."""
+    from armscan.volumes.dataset import copies_among
     from armscan.volumes.manifest import MANIFEST_NAMES
 
     # Lines of a file or a pipe are never wrapped.
     console = wide_console(WHOLE_CHARS)
+    planes = {name: _plane_of(report.volume) for name, report in dataset.reports.items()}
     for name, report in dataset.reports.items():
-        plane = _plane_of(report.volume)
         split = f"for {dataset.splits[name]}, " if dataset.splits else ""
-        console.print(Text(f"{name}: subject {dataset.subjects[name]}, {split}{plane}", style="bold"))
+        console.print(Text(f"{name}: subject {dataset.subjects[name]}, {split}{planes[name]}", style="bold"))
         console.print(Text(_geometry(report)))
         console.print(_tissue_table(report))
         for note in (*report.notes, *(_coarse_note(report.volume) if report.has_size_of_an_arm else ())):
@@ -44,10 +46,16 @@ def print_dataset(dataset: Dataset, folder: Path) -> None:
         console.print(Text(f"not read: {few(others, N_LISTED)}"))
     for name, reason in dataset.excluded.items():
         console.print(Text(f"{name}: excluded" + ("" if reason == "True" else f" ({reason})")))
+    for other, name in copies_among(dataset.volumes):
+        if dataset.subjects[name] != dataset.subjects[other]:
+            console.print(Text(f"note: {name} is a copy of {other}: give both the same subject, or remove one"))
     n_volumes, n_subjects = len(dataset.reports), len(set(dataset.subjects.values()))
-    n_labelled = sum(dataset.volumes[name].optimal_action is not None for name in dataset.reports)
+    n_labelled = sum(plane != UNLABELLED for plane in planes.values())
+    n_wrong = sum(plane not in (LABELLED, UNLABELLED) for plane in planes.values())
+    wrong = f" ({n_wrong} of them must be corrected, see above)" if n_wrong else ""
     console.print(
-        f"{counted(n_volumes, 'volume')} of {counted(n_subjects, 'subject')}, {n_labelled} with a labelled plane",
+        f"{counted(n_volumes, 'volume')} of {counted(n_subjects, 'subject')}, "
+        f"{n_labelled} with a labelled plane{wrong}",
         style="bold",
         highlight=False,
     )
@@ -62,12 +70,12 @@ def _plane_of(volume: LabelVolume) -> str:
     from armscan.volumes.labelmap import LANDMARKS, TISSUE_LABELS
 
     if volume.optimal_action is None:
-        return "no labelled plane"
+        return UNLABELLED
     if (plane := reachable_optimum(volume)) is None:
-        return "a labelled plane that misses the volume"
+        return f"{LABELLED} that misses the volume"
     labels = volume.slice(plane)
     missing = [tissue for tissue in LANDMARKS if TISSUE_LABELS[tissue] not in labels]
-    return "a labelled plane" + (f" that shows no {listed(missing)}" if missing else "")
+    return LABELLED + (f" that shows no {listed(missing)}" if missing else "")
 
 
 def _coarse_note(volume: LabelVolume) -> list[str]:

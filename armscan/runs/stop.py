@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 from collections.abc import Collection
 from dataclasses import dataclass
+from pathlib import Path
 
 from mlflow.entities import Run
 
@@ -61,8 +63,18 @@ def interrupt(run: Run) -> str:
     if note is None or not note.process.is_here or not note.process.is_alive:
         raise unknown
     try:
-        os.kill(note.process.pid, signal.SIGINT)
+        # Runs treat both alike.
+        os.kill(note.process.pid, signal.SIGTERM if _ignores_sigint(note.process.pid) else signal.SIGINT)
     # It has ended since.
     except ProcessLookupError as error:
         raise unknown from error
     return f"run {run_id}: its process {note.process.pid} was interrupted, and ends as with Ctrl-C"
+
+
+def _ignores_sigint(pid: int) -> bool:
+    """Return whether a process ignores SIGINT, as those do that a shell script starts with `&`; False if unknown."""
+    try:
+        found = re.search(r"SigIgn:\s*([0-9a-f]+)", Path(f"/proc/{pid}/status").read_text())
+    except OSError:
+        return False
+    return found is not None and bool(int(found[1], 16) >> (signal.SIGINT - 1) & 1)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Hashable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-
-import numpy as np
 
 from armscan.errors import InvalidValueError, few
 from armscan.training.fingerprints import Fingerprints
@@ -13,7 +11,7 @@ from armscan.training.subject_splits import PHANTOMS, parts_by_subject
 from armscan.utils.text import counted
 from armscan.utils.validation import MAX_SEED, check_choice, check_int, check_path
 from armscan.volumes import Dataset, LabelVolume, load_phantoms, open_dataset
-from armscan.volumes.dataset import SPLITS
+from armscan.volumes.dataset import SPLITS, copies_among
 from armscan.volumes.phantom import VERSIONS
 from armscan.volumes.phantom.generate import PHANTOM_NAME
 
@@ -61,18 +59,13 @@ class Split:
         self._check_copies()
 
     def _check_copies(self) -> None:
-        # Not by fingerprint: a copy with another labelled plane is one, too.
-        seen: dict[Hashable, list[tuple[str, str, LabelVolume]]] = {}
-        for part, volumes in self.parts.items():
-            for name, volume in volumes.items():
-                similar = seen.setdefault(_sample(volume), [])
-                for other, its_part, its_volume in similar:
-                    if part != its_part and np.array_equal(volume.labels_yxz, its_volume.labels_yxz):
-                        raise InvalidValueError(
-                            f"{name} ({part}) is a copy of {other} ({its_part}), but a wrist must be in one part: "
-                            "give both the same subject in the manifest, or remove one"
-                        )
-                similar.append((name, part, volume))
+        of_parts = {(part, name): volume for part, volumes in self.parts.items() for name, volume in volumes.items()}
+        for (its_part, other), (part, name) in copies_among(of_parts):
+            if part != its_part:
+                raise InvalidValueError(
+                    f"{name} ({part}) is a copy of {other} ({its_part}), but a wrist must be in one part: "
+                    "give both the same subject in the manifest, or remove one"
+                )
 
     @property
     def parts(self) -> dict[str, dict[str, LabelVolume]]:
@@ -96,11 +89,6 @@ class Split:
         return {
             part: {name: volume.fingerprint for name, volume in volumes.items()} for part, volumes in self.parts.items()
         }
-
-
-def _sample(volume: LabelVolume) -> Hashable:
-    """Return the spacing and a few voxels, the same in all copies: to compare every pair of volumes would take long."""
-    return volume.shape, volume.spacing, volume.labels_yxz[::16].tobytes()
 
 
 def phantom_data(

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping
+from collections.abc import Hashable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
 
 from armscan.errors import ManifestError, VolumeError, few, listed
 from armscan.utils.validation import check_choice, check_path
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
     from armscan.volumes.manifest_schema import Manifest, Splits
 
 SPLITS = ("train", "validation", "test")
+Key = TypeVar("Key", bound=Hashable)
 
 
 @dataclass(frozen=True)
@@ -158,3 +161,13 @@ def _manifest_of(path: str | Path, *, require_manifest: bool) -> tuple[Path | No
         command = f"armscan data label {shlex.quote(str(folder))}"
         raise ManifestError(f"{folder}: the folder has no manifest ({names}); {command} writes one")
     return None, Manifest(), files
+
+
+def copies_among(volumes: Mapping[Key, LabelVolume]) -> Iterator[tuple[Key, Key]]:
+    """Yield the pairs of volumes with the same voxels, whose labelled planes may differ, by their keys."""
+    # To compare every pair of volumes would take long: copies also have the same spacing and sample of voxels.
+    seen: dict[Hashable, list[Key]] = {}
+    for key, volume in volumes.items():
+        similar = seen.setdefault((volume.shape, volume.spacing, volume.labels_yxz[::16].tobytes()), [])
+        yield from ((other, key) for other in similar if np.array_equal(volumes[other].labels_yxz, volume.labels_yxz))
+        similar.append(key)

@@ -137,8 +137,8 @@ def map_values(
                 "they are in the folder's manifest.yaml: labels: {bones: [...], tendons: [...], artery: [...]}"
             )
         raise VolumeError(
-            f"{where}: holds {shown(unnamed)}, which the label map does not name; every value must be named, or others "
-            "must be background"
+            f"{where}: holds {shown(unnamed)}, which the label map does not name (a number in quotes is the name of a "
+            "segment); every value must be named, or others must be background"
         )
     named = {value: label for value, label in table.items() if label is not None}
     return apply_table(whole, named), tuple(FoundSource(value, named[value], counts[value]) for value in counts)
@@ -174,12 +174,14 @@ def apply_table(values: NDArray[np.integer[Any]], table: Mapping[int, int]) -> N
 
 def check_landmarks(found: tuple[FoundSource, ...], labels: LabelMap, where: str) -> None:
     """Raise `VolumeError` unless the file has voxels of every landmark."""
-    for tissue in LANDMARKS:
-        if not any(each.n_voxels for each in found if each.label == TISSUE_LABELS[tissue]):
-            raise VolumeError(
-                f"{where}: no voxel is {tissue}, which is {shown(getattr(labels, tissue))} by the label map, but every "
-                f"landmark must be there; the file holds {shown([each.source for each in found])}"
-            )
+    there = {each.label for each in found if each.n_voxels}
+    missing = [tissue for tissue in LANDMARKS if TISSUE_LABELS[tissue] not in there]
+    if missing:
+        named = listed(f"{tissue} ({shown(getattr(labels, tissue))})" for tissue in missing)
+        raise VolumeError(
+            f"{where}: no voxel is {named} by the label map, but every landmark must be there; the file holds "
+            f"{shown([each.source for each in found])}"
+        )
 
 
 def shown(sources: Iterable[Source]) -> str:

@@ -10,7 +10,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from armscan.errors import InvalidValueError, VolumeError, printable
+from armscan.errors import InvalidValueError, VolumeError, listed, printable
 from armscan.utils.arrays import FloatArray
 from armscan.utils.validation import check_int, check_numbers
 from armscan.volumes.labelmap import ALLOWED_LABELS, LABEL_NAMES, LANDMARK_LABELS, check_whole, shown
@@ -220,12 +220,11 @@ def _checked_labels(labels: NDArray[np.generic], name: str) -> NDArray[np.uint8]
         raise VolumeError(f"{name}: holds the values {shown(np.unique(whole).tolist())}, but {ALLOWED_LABELS} only")
     # A copy, so that later changes to the caller's array do not change the volume.
     checked = np.array(whole.transpose(1, 0, 2), dtype=np.uint8, order="C").transpose(1, 0, 2)
-    for label in LANDMARK_LABELS:
-        if not (checked == label).any():
-            raise VolumeError(
-                f"{name}: no voxel is labelled {label} ({LABEL_NAMES[label]}), but every landmark is required; "
-                "exclude: REASON in its entry of the manifest leaves the volume out"
-            )
+    if missing := [f"{label} ({LABEL_NAMES[label]})" for label in LANDMARK_LABELS if not (checked == label).any()]:
+        raise VolumeError(
+            f"{name}: no voxel is labelled {listed(missing)}, but every landmark is required; "
+            "exclude: REASON in its entry of the manifest leaves the volume out"
+        )
     checked.flags.writeable = False
     return checked
 

@@ -55,9 +55,19 @@ def test_data_command_notes_a_palm_at_low_z_and_a_plane_that_misses_the_volume(d
     manifest.write_text(f"orientation: LPI\nvolumes: {{{volume.name}: {{rotation: [0, 0], translation: [0, 5000]}}}}\n")
     printed = inspected()
     assert "a labelled plane that misses the volume" in printed
+    assert "1 volume of 1 subject, 1 with a labelled plane (1 of them must be corrected, see above)" in printed
     assert "note: the palm is at low z" in printed
     manifest.write_text("orientation: LPS\n")
     assert "note:" not in inspected()
+
+
+def test_data_command_notes_copies_under_another_subject(write_labelmap, tmp_path, inspected):
+    for name in ("a.nrrd", "b.nrrd"):
+        write_labelmap(name)
+    said = "note: b.nrrd is a copy of a.nrrd: give both the same subject, or remove one"
+    assert said in inspected()
+    (tmp_path / "manifest.yaml").write_text("volumes: {a.nrrd: {subject: S}, b.nrrd: {subject: S}}")
+    assert said not in inspected()
 
 
 def test_data_command_notes_coarse_voxels_a_size_that_no_arm_has_and_a_plane_without_landmarks(

@@ -80,7 +80,7 @@ def test_read_volume_makes_others_background_where_that_is_said(write_labelmap, 
 def test_read_volume_refuses_a_landmark_that_the_map_finds_nowhere(write_labelmap, tiny_volume):
     labels = LabelMap(bones=[10], tendons=[20], artery=[30, 33], nerve=[300])
     stored = numbered(tiny_volume.labels, {1: 10, 2: 20, 3: 300})
-    with pytest.raises(VolumeError, match=r"no voxel is artery, which is 30, 33 by .*; the file holds 0, 10, 20, 300"):
+    with pytest.raises(VolumeError, match=r"no voxel is artery .30, 33. by .*; the file holds 0, 10, 20, 300"):
         read_volume(write_labelmap(labels=stored), labels=labels)
 
 

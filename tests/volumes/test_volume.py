@@ -50,6 +50,7 @@ def test_volume_measures_itself():
         (labels_with(1, 2, 3, 300, dtype=np.int32), "wrist: .*300"),
         (labels_with(1, 2), "wrist: no voxel is labelled 3 .artery"),
         (labels_with(2, 3), "wrist: no voxel is labelled 1 .bones"),
+        (labels_with(2), "wrist: no voxel is labelled 1 .bones. or 3 .artery., but every"),
         (labels_with("a", "b", dtype="U1"), "wrist: "),
     ],
 )

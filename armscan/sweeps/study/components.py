@@ -20,6 +20,7 @@ from armscan.config.defaults import to_plain
 from armscan.config.error_messages import one_line_message
 from armscan.config.sources import SWEEP
 from armscan.errors import ArmscanError, InvalidValueError, StudyError, listed, reason_of
+from armscan.sweeps.scheduling.state import TEST_PREFIX
 from armscan.sweeps.space.parameter import Value, overrides_of
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.study.arguments import fixed_by
@@ -73,6 +74,11 @@ def read_settings(overrides: Sequence[str]) -> tuple[StudySettings, Task, DictCo
     task: Any = make("task", settings.task, object)
     if missing := [name for name in TASK_MEMBERS if not hasattr(task, name)]:
         raise InvalidValueError(f"study.task is {settings.task['_target_']}, which has no {missing[0]}, as a task must")
+    if not str(task.final_metric).startswith(TEST_PREFIX):
+        raise InvalidValueError(
+            f"study.task is {settings.task['_target_']}, whose final_metric is {task.final_metric!r}, but it must "
+            f"begin with {TEST_PREFIX}, as all metrics that its evaluate returns"
+        )
     of_trials, _ = of_run(config)
     returned = task.metrics(of_trials)
     for name in settings.objectives:

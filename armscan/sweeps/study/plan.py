@@ -139,11 +139,13 @@ def final_trainings_left(settings: StudySettings, final: FinalEvaluation | None,
     Args:
         settings: Settings of the study, which may have changed since the final evaluation was begun.
         final: The final evaluation; None if it has not been started.
-        n_left: Trials of the search that are left: they may change the candidates.
+        n_left: Trials of the search that are left, which may change the candidates, or not.
     """
     fewest, most = n_trainings(settings.final_eval)
-    if final is None or n_left:
+    if final is None:
         return fewest, most
+    if n_left:
+        return min(fewest, final_trainings_left(settings, final, n_left=0)[0]), most
     final = replace(final, settings=settings.final_eval)
     race = final.race()
     wanted = set(final.trainings_of_judgement(race))
@@ -166,7 +168,7 @@ def _final(settings: FinalEvalSettings) -> str:
     n_first, n_mean = settings.min_seeds, settings.mean_seeds
     further = f" at first, and at most {n_mean} each on average," if n_first < n_mean else ""
     return (
-        f"at least {fewest} and at most {most} final trainings: {candidates} and the control with "
+        f"at most {most} final trainings, and with {candidates} at least {fewest}: the candidates and the control with "
         f"{counted(n_first, 'seed')} each{further} to select one, then that one and the control with "
         f"{settings.judge_seeds} more each on the test volumes"
     )

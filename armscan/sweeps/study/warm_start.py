@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -102,10 +102,11 @@ def initial_trials(
     presets = [name for name in settings.enqueue if PRESET.format(name) not in begun_with]
     sources = [name for name in settings.warm_start if SOURCE.format(name) not in begun_with]
     storage = existing_storage(settings.storage) if sources else None
-    initial = [
-        *(_of_preset(settings.space, name, overrides) for name in presets),
-        *(_of_study(settings, name, fixed, storage) for name in sources),
-    ]
+    initial = [_of_preset(settings.space, name, overrides) for name in presets]
+    known = {_place(settings.name, trial) for trial in study.get_trials(deepcopy=False)} if study is not None else set()
+    for name in sources:
+        initial.append(_of_study(settings, name, fixed, storage, known))
+        known |= {trial.user_attrs[TAKEN_FROM] for trial in initial[-1].taken}
     # Finished trials first: settings that have a value need not be tried again.
     return sorted(initial, key=lambda each: not each.taken)
 
@@ -135,7 +136,10 @@ def values_of(space: Space, overrides: Sequence[str]) -> tuple[dict[str, Value],
     return space.fit({key: optuna_value(value) for key, value in plain.items()})
 
 
-def _of_study(settings: StudySettings, name: str, fixed: Mapping[str, Any], storage: Storage | None) -> InitialTrials:
+def _of_study(
+    settings: StudySettings, name: str, fixed: Mapping[str, Any], storage: Storage | None, known: Collection[str]
+) -> InitialTrials:
+    """Return the initial trials from another study, without those at `known` places, which the study has already."""
     source, wanted = _source(settings, name, storage), comparable_settings(settings, fixed)
     trials = [trial for trial in source.get_trials(deepcopy=False) if trial.state in FINISHED]
     difference = _difference(source, wanted)
@@ -155,8 +159,10 @@ def _of_study(settings: StudySettings, name: str, fixed: Mapping[str, Any], stor
     message = f"warm start from {name}, which has {counted(len(trials), 'finished trial')}: "
     left = f"; {sum(misfits.values())} do not fit, such as: {misfits.most_common(1)[0][0]}" if misfits else ""
     if difference is None:
-        taken = tuple(_taken(name, trial, chosen, settings.space) for trial, chosen in fitting)
-        return InitialTrials(SOURCE.format(name), f"{message}{len(taken)} taken with their values{left}", taken)
+        new = [(trial, chosen) for trial, chosen in fitting if _place(name, trial) not in known]
+        taken = tuple(_taken(name, trial, chosen, settings.space) for trial, chosen in new)
+        there = f"; {len(fitting) - len(new)} already there" if len(new) < len(fitting) else ""
+        return InitialTrials(SOURCE.format(name), f"{message}{len(taken)} taken with their values{there}{left}", taken)
     if _is_opposed(source, wanted):
         return InitialTrials(SOURCE.format(name), f"{message}none taken, because {difference}{left}", ())
     settings_of = {trial.number: chosen for trial, chosen in fitting if chosen}
@@ -228,9 +234,14 @@ def first_different(settings: Iterable[dict[str, Value]]) -> tuple[dict[str, Val
     return tuple(first)
 
 
+def _place(name: str, trial: FrozenTrial) -> str:
+    """Return the study and number that a trial of a study first had."""
+    return str(trial.user_attrs.get(TAKEN_FROM, f"{name}:{trial.number}"))
+
+
 def _taken(name: str, trial: FrozenTrial, chosen: dict[str, Value], space: Space) -> FrozenTrial:
     """Return a trial of another study as one of this study, with the study and number that it had there."""
-    place = trial.user_attrs.get(TAKEN_FROM, f"{name}:{trial.number}")
+    place = _place(name, trial)
     return create_trial(
         state=trial.state,
         values=trial.values,

@@ -223,8 +223,8 @@ def test_plan_counts_the_final_trainings_that_are_left(storage_uri):
     assert final_trainings_left(settings, final, n_left=0) == (fewest - 1, most - 1)
     final = run(storage_uri)
     assert final_trainings_left(settings, final, n_left=0) == (0, 0)
-    # Further trials may change the candidates.
-    assert final_trainings_left(settings, final, n_left=1) == (fewest, most)
+    # Further trials may change the candidates, or not.
+    assert final_trainings_left(settings, final, n_left=1) == (0, most)
     more = settings.model_copy(
         update={"final_eval": settings.final_eval.model_copy(update={"judge_seeds": len(final.judge_seeds) + 2})}
     )

@@ -201,3 +201,21 @@ def test_presets_of_each_sweep_lie_in_its_space(sweep):
     asked, _, config = read_settings(words)
     initial = initial_trials(asked, words, to_plain(config), None)
     assert [len(each.enqueued) for each in initial] == [1] * len(asked.enqueue)
+
+
+def test_trials_that_a_study_has_already_are_not_taken_again(study_in):
+    space, rows = {"agent.lr": LR}, [({"agent.lr": 1e-3}, 3.0), ({"agent.lr": 2e-3}, 2.0)]
+    study_in("a", space, rows=rows)
+    second = study_in("b", space, rows=[({"agent.lr": 3e-3}, 1.0)], warm_start=("a",))
+    begin(second)
+    # Those of "a" only once, however many sources have them.
+    third = study_in("c", space, warm_start=("a", "b"))
+    first_said, then_said = begin(third)
+    assert "2 taken with their values" in first_said
+    assert "which has 3 finished trials: 1 taken with their values; 2 already there" in then_said
+    assert len(third[2].trials) == 3
+    # Nor a study's own.
+    asked, storage, study = study_in("a", space, warm_start=("b",))
+    (said,) = begin((asked, storage, study))
+    assert "1 taken with their values; 2 already there" in said
+    assert len(study.trials) == 3
