@@ -284,7 +284,10 @@ MISTAKES = [
     ("study.pruner._target_=collections.Counter", "but it must be a pruner of Optuna"),
     ("study.task._target_=foo.Foo", "study.task cannot be made: Error loading 'foo.Foo'"),
     ("study.task._target_=collections.Counter", "which has no metrics, as a task must"),
-    ("study.task._target_=tests.sweeps.test_command.LossTask", "but it must begin with test/, as all metrics that its evaluate"),
+    (
+        "study.task._target_=tests.sweeps.test_command.LossTask",
+        "but it must begin with test/, as all metrics that its evaluate",
+    ),
     ("study.storage=3", "study.storage is 3, but it must be a string that says where"),
     ("study.storage=''", "study.storage is '', but it must be a string that says where"),
     ("study.folder=''", "study.folder is '', but it must be a string that says where"),
