@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -114,6 +115,8 @@ def evaluate(
     The rules of the episodes and --device are the agent's own by default. docs/metrics.md explains the metrics,
     docs/seeing.md the video.
     """
+    # As in `armscan run`: the evaluation's run is closed as KILLED.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     changes = {name: value for name, value in rules.items() if value is not None}
     _check_words(run, agent, data, changes)
     _check_options(agent, data, tracking_experiment, video=video)

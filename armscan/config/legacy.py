@@ -73,6 +73,9 @@ def renamed(config: Mapping[str, Any], path: str = "") -> dict[str, Any]:
         key = f"{path}{name}"
         if isinstance(value, Mapping):
             value = renamed(value, f"{key}.")
+        elif isinstance(value, list):
+            # Such as the segments of a schedule, which have dotted keys.
+            value = [renamed(each) if isinstance(each, Mapping) else each for each in value]
         elif key in INVERTED:
             value = OPPOSITES.get(value, value)
         elif isinstance(value, str):

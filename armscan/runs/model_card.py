@@ -64,7 +64,7 @@ class Card:
             # If there is no room for both, the run's own evaluation stays.
             if len(text + section) <= MAX_CHARS:
                 text += section
-            # Tags cannot name changed rules, so all come from one evaluation that has changed none.
+            # Tags cannot say that rules were changed: all are from the first evaluation without changes.
             tags = tags or ({} if report.facts.get("changes") else _tags(report))
         return cls(text, tags)
 

@@ -63,7 +63,7 @@ def interrupt(run: Run) -> str:
     if note is None or not note.process.is_here or not note.process.is_alive:
         raise unknown
     try:
-        # Runs treat both alike.
+        # Runs and evaluations treat both alike.
         os.kill(note.process.pid, signal.SIGTERM if _ignores_sigint(note.process.pid) else signal.SIGINT)
     # It has ended since.
     except ProcessLookupError as error:

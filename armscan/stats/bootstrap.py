@@ -45,6 +45,11 @@ class Estimate(NamedTuple):
         """Whether it has an interval whose ends differ by more than rounding."""
         return math.isfinite(self.low) and not math.isclose(self.low, self.high, rel_tol=1e-9, abs_tol=1e-12)
 
+    @property
+    def if_wide(self) -> Estimate:
+        """The estimate, without an interval that has no width."""
+        return self if self.has_width else Estimate(self.value, math.nan, math.nan)
+
     @classmethod
     def around(cls, mean: Any, half_width: Any) -> Estimate:
         """Return a mean with a symmetric interval, which is NaN if `half_width` is."""

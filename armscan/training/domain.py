@@ -98,7 +98,7 @@ class TrainingDomain:
         parts = [*_parts(_spelled_out(observation))]
         compared: list[tuple[str, Sequence[Range], Sequence[Range], str, str, str]] = []
         if any(map(_is_in_pixels, parts)):
-            means = "images and plain cluster numbers have another scale"
+            means = "what the agent sees in pixels has another scale"
             compared.append(("a pixel", self.pixel_mm, other.pixel_mm, "in depth", "mm", means))
         if any(part.get("crop", 0) is None and part.get("shape") is not None for part in parts):
             cropped = [(min(here, trained),) * 2 for here, trained in zip(other.slice_px, self.slice_px, strict=True)]

@@ -108,15 +108,14 @@ def _verdict(above: Estimate | None) -> str:
     """Return whether an agent is better than random planes, judged by the interval of the difference."""
     if above is None or math.isnan(above.value):
         return ""
-    # Without negative zeros.
-    points = Estimate(*(round(100 * each, 1) + 0.0 for each in above))
-    size = f"{points.value:+.1f} points"
+    points = Estimate(*(100 * each for each in above))
+    size = f"{points.value:+z.1f} points"
     if math.isnan(points.low):
         return f"Difference {size}, one subject and one seed: this allows no conclusion about others."
-    interval = f"{size} ({points.low:+.1f} to {points.high:+.1f})"
-    if above.low > 0:
+    interval = f"{size} ({points.low:+z.1f} to {points.high:+z.1f})"
+    if points.low > 0:
         return f"Better than random: {interval}."
-    return f"Worse than random: {interval}." if above.high < 0 else f"Not shown to be better than random: {interval}."
+    return f"Worse than random: {interval}." if points.high < 0 else f"Not shown to be better than random: {interval}."
 
 
 def _text(estimate: Estimate, form: str) -> str:

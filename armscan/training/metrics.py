@@ -137,7 +137,7 @@ class MetricEstimates:
     def estimate(self, name: str) -> Estimate:
         """Return a figure as it is shown: NaN if there is none; with Wilson's interval if its own has no width."""
         estimate = self.estimates.get(name, UNKNOWN)
-        return estimate if estimate.low < estimate.high else self.estimates.get(name + WILSON, estimate)
+        return estimate if estimate.has_width else self.estimates.get(name + WILSON, estimate)
 
     def metrics(self) -> dict[str, float]:
         """Return all numbers by name as they are shown, the ends of an interval as `..._low` and `..._high`."""

@@ -136,9 +136,11 @@ def map_values(
                 f"{where}: holds the values {shown(counts)}, but {ALLOWED_LABELS} only; if it is no image, say what "
                 "they are in the folder's manifest.yaml: labels: {bones: [...], tendons: [...], artery: [...]}"
             )
+        is_quoted = any(str(value) in labels.by_source for value in unnamed)
+        hint = " (a number in quotes is the name of a segment)" if is_quoted else ""
         raise VolumeError(
-            f"{where}: holds {shown(unnamed)}, which the label map does not name (a number in quotes is the name of a "
-            "segment); every value must be named, or others must be background"
+            f"{where}: holds {shown(unnamed)}, which the label map does not name{hint}; every value must be named, or "
+            "others must be background"
         )
     named = {value: label for value, label in table.items() if label is not None}
     return apply_table(whole, named), tuple(FoundSource(value, named[value], counts[value]) for value in counts)

@@ -149,6 +149,9 @@ def test_values_of_an_old_trial_are_given_by_their_new_names():
 
 @pytest.mark.parametrize("config", [{"agent": {"astray_share": 0.2}}, {"agent.astray_share": 0.2}])
 def test_key_that_was_renamed_later_is_migrated_alone(config):
+    schedule = {"training": {"schedule": [{"from_env_steps": 8, "agent.astray_share": 0.1}]}}
+    renamed = {"training": {"schedule": [{"from_env_steps": 8, "agent.perturbed_share": 0.1}]}}
+    assert migrate(config | schedule).items() >= renamed.items()
     new = {"agent": {"perturbed_share": 0.2}} if "agent" in config else {"agent.perturbed_share": 0.2}
     assert migrate(config) == new
     assert migrate(new) == new

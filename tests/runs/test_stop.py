@@ -12,8 +12,8 @@ from armscan.runs import stop
 WORK = """
 import signal, time
 signal.signal(signal.SIGTERM, signal.default_int_handler)
-print("ready", flush=True)
 try:
+    print("ready", flush=True)
     time.sleep(60)
 except KeyboardInterrupt:
     raise SystemExit(130)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -110,7 +109,7 @@ def _mean_of(name: str, of_seeds: Sequence[Mapping[str, float]], subject_of: Map
     volumes, scores = scores_of(name, of_seeds)
     found = mean_over_seeds(of_subjects(scores, [subject_of.get(volume, volume) for volume in volumes]))
     # Equal scores do not say how others would differ.
-    return found if found.has_width else Estimate(found.value, math.nan, math.nan)
+    return found.if_wide
 
 
 def bounds_in(search: optuna.Study, metric: str) -> tuple[float, float]:

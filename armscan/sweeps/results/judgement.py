@@ -69,7 +69,7 @@ class Difference(NamedTuple):
     @property
     def estimate(self) -> Estimate:
         """The mean difference, without an interval if all differences are equal."""
-        return Estimate(self.paired.value, math.nan, math.nan) if self.is_constant else self.paired
+        return self.paired.if_wide
 
     @property
     def verdict(self) -> str:

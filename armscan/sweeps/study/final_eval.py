@@ -84,11 +84,6 @@ class FinalEvaluation:
         """Factor that makes higher values of the first objective better."""
         return -1.0 if self.search.directions[0] == StudyDirection.MINIMIZE else 1.0
 
-    @property
-    def has_judged(self) -> bool:
-        """Whether a training has been evaluated on the test volumes, perhaps with earlier settings."""
-        return bool(self.judgement.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)))
-
     def contenders(self) -> list[int]:
         """Return the control and the numbers of the candidates, the best trials; nothing if no trial has finished."""
         best = best_trials(self.search, self.settings.top_k + 1)

@@ -30,6 +30,7 @@ from armscan.tracking import TrackedRun, sync
 from armscan.tracking.run import SHORT_WAIT_S
 from armscan.tracking.store import store_errors
 from armscan.tracking.sync import IN_USE
+from armscan.training.episode_results import TEST_METRICS
 from armscan.utils.console import print_sentence
 from armscan.utils.processes import ProcessInfo
 from armscan.utils.retry import no_retry
@@ -185,11 +186,11 @@ def _conclude(opened: OpenedStudy, tracked: TrackedRun) -> tuple[str, str | None
                 phase.close_runs_of(trial)
             failure = failure or phase.scheduler.failure_reason(phase.scheduler.state())
             stopped = stopped or phase.scheduler.read_stop_request()
-        final, search = opened.final_eval, opened.search.scheduler.study
-        judgement = judge(final) if final is not None else None
+        search = opened.search.scheduler.study
+        judgement = judge(opened.final_eval) if opened.final_eval is not None else None
         note = result_note(judgement)
         # While a study that goes on has no new result, its run keeps all of the earlier one.
-        if note or final is None or not final.has_judged:
+        if note or not _has_result(opened):
             tracked.log_metrics(best_metrics(search, judgement), n_env_steps=0, keeps_nan=True)
         if note:
             tracked.set_description(note)
@@ -199,6 +200,14 @@ def _conclude(opened: OpenedStudy, tracked: TrackedRun) -> tuple[str, str | None
     if failure:
         return "FAILED", failure
     return ("KILLED", f"stopped {stopped}") if stopped else ("FINISHED", None)
+
+
+def _has_result(opened: OpenedStudy) -> bool:
+    """Return whether the study's run has the metrics of a result, perhaps an earlier one."""
+    client = opened.search.client
+    with store_errors(client.uri):
+        metrics = client.get_run(opened.search.run_id).data.metrics
+    return any(name.startswith(f"{TEST_METRICS}/") for name in metrics)
 
 
 def _upload(opened: OpenedStudy, monitor: StudyMonitor, tracked: TrackedRun, status: str, reason: str | None) -> None:

@@ -52,9 +52,13 @@ class StudyMonitor:
 
     def is_worked_on(self) -> bool:
         """Return whether the worker of any running trial is alive and, by its clock, has renewed its lease lately."""
-        running = (trial for phase in self._opened.phases for trial in phase.scheduler.state().running)
-        beats_s = (trial.user_attrs.get(LEASE, {}).get(BEAT_S, 0.0) for trial in running)
-        return self.is_alive() and any(time.time() - beat_s < LIFELESS_S for beat_s in beats_s)
+        now_s = time.time()
+        return any(
+            now_s - trial.user_attrs.get(LEASE, {}).get(BEAT_S, 0.0) < LIFELESS_S
+            and not self._liveness[phase.name].is_dead(trial)
+            for phase in self._opened.phases
+            for trial in phase.scheduler.state().running
+        )
 
     def wait_until_over(self) -> bool:
         """Wait as long as any worker is alive; return whether the study is over then."""

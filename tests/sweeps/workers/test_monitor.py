@@ -2,6 +2,7 @@
 
 import threading
 import time
+from dataclasses import asdict
 from types import SimpleNamespace
 
 import optuna
@@ -15,6 +16,7 @@ from armscan.sweeps.storage.attribute_names import FINAL_SEED, FINALIST, LEASE, 
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.workers import monitor as module
 from armscan.sweeps.workers.monitor import StudyMonitor
+from armscan.utils.processes import ProcessInfo
 from tests.support.waiting import HANG_S
 
 ELSEWHERE = {"worker": "0", "host": "elsewhere", "pid": 1, "started": "1"}
@@ -79,7 +81,10 @@ def test_study_that_was_stopped_is_over_without_its_final_evaluation(watch):
 
 @pytest.mark.parametrize(("age_s", "is_worked_on"), [(5.0, True), (600.0, False)])
 def test_study_is_worked_on_while_leases_are_renewed(watch, age_s, is_worked_on):
-    monitor, _, running = watch()
+    monitor, scheduler, running = watch()
+    # A dead worker of this machine, whose last heartbeat does not count.
+    dead = asdict(ProcessInfo.current()) | {"worker": "1", "pid": 2**22, "beat": 1, "beat_s": time.time()}
+    scheduler.study.ask().set_user_attr(LEASE, dead)
     running.set_user_attr(LEASE, ELSEWHERE | {"beat": 1, "beat_s": time.time() - age_s})
     assert monitor.is_worked_on() == is_worked_on
 
