@@ -155,7 +155,7 @@ def prepare_on_volumes(
         if source.domain is not None:
             rules = to_plain(source.config.env)
             found = source.domain.differences(
-                here, rules["observation"], is_bounded=rules["translation_bounds_mm"] is not None
+                here, rules.get("observation"), is_bounded=rules.get("translation_bounds_mm") is not None
             )
             notes += [f"{label}: {difference}" for difference in found]
         # If a run has no training domain, the groups of volumes must at least match each other.
