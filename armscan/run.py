@@ -84,7 +84,7 @@ def launch(words: Sequence[str]) -> None:
         application(run)()
     except Exception as error:
         launcher = Multirun.launcher
-        # Of a grid: studies report their launcher's errors themselves.
+        # Only for grids: studies report their launcher's errors themselves.
         if launcher is None or launcher in ON_THIS_MACHINE or is_interruption(error) or one_line_message(error):
             raise
         raise launcher_error(launcher, error) from error

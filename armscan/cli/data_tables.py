@@ -1,4 +1,4 @@
-"""What `armscan data` prints: a table for each volume, and the planes that were found."""
+"""Tables of the volumes in a folder, and of the planes found in them, for `armscan data`."""
 
 from __future__ import annotations
 

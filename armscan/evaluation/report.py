@@ -69,7 +69,7 @@ class EvaluationReport:
 
     @cached_property
     def baselines_by_split(self) -> dict[str, dict[str, MetricEstimates]]:
-        """Return the metrics of the baselines but their times, by their names, then as `by_split`."""
+        """Return the metrics of the baselines, without times, by the baseline's name, then as `by_split`."""
         return {
             name: {label: _untimed(MetricEstimates.of(each)) for label, each in self._with_total(evaluations).items()}
             for name, evaluations in self.baselines.items()

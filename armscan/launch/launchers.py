@@ -37,7 +37,7 @@ def check_launcher(name: str) -> None:
 
 
 def launcher_error(name: str, error: Exception) -> ArmscanError:
-    """Return what to report of any error of a launcher, which its libraries raise."""
+    """Return an error that names the launcher, for any error that one of its libraries has raised."""
     return ArmscanError(f"{LAUNCHER} is {name!r}, which has failed: {one_line_message(error) or reason_of(error)}")
 
 

@@ -47,7 +47,7 @@ class Estimate(NamedTuple):
 
     @property
     def if_wide(self) -> Estimate:
-        """The estimate, without an interval that has no width."""
+        """The estimate; its interval is NaN if it has no width."""
         return self if self.has_width else Estimate(self.value, math.nan, math.nan)
 
     @classmethod

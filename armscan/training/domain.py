@@ -164,7 +164,7 @@ def _parts(rules: Any) -> Iterator[dict[str, Any]]:
 
 
 def _is_in_pixels(part: Mapping[str, Any]) -> bool:
-    """Return whether what an observation shows depends on the size of pixels, as far as it is known."""
+    """Return whether an observation depends on the size of pixels; a class of the user's own may."""
     name = str(part.get("_target_")).rpartition(".")[2]
     return name not in IN_MM and not (name == "ClusterObservation" and part.get("normalised", True))
 

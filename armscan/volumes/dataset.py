@@ -164,7 +164,7 @@ def _manifest_of(path: str | Path, *, require_manifest: bool) -> tuple[Path | No
 
 
 def copies_among(volumes: Mapping[Key, LabelVolume]) -> Iterator[tuple[Key, Key]]:
-    """Yield the pairs of volumes with the same voxels, whose labelled planes may differ, by their keys."""
+    """Yield the keys of every two volumes with the same voxels; their labelled planes may differ."""
     # To compare every pair of volumes would take long: copies also have the same spacing and sample of voxels.
     seen: dict[Hashable, list[Key]] = {}
     for key, volume in volumes.items():

@@ -113,7 +113,7 @@ def count_voxels(path: Path, sizes: Sequence[int]) -> int:
     """Return how many voxels an image of these sizes has; raise `VolumeError` if it has none, or too many."""
     if min(sizes, default=0) < 1:
         raise VolumeError(f"{path}: the image has the size {tuple(sizes)}, but a labelmap must not be empty")
-    # Few compressed bytes may hold more than the memory.
+    # A few compressed bytes can expand beyond the memory.
     if (n_voxels := math.prod(sizes)) > MAX_VOXELS:
         raise VolumeError(f"{path}: the image has {n_voxels} voxels, but a labelmap has at most {MAX_VOXELS}")
     return n_voxels

@@ -54,11 +54,12 @@ def charts_of(
     if not complete:
         yield "<p>No trial has run to its end yet.</p>"
         return
+    violating = "" if all(map(is_feasible, complete)) else "trials that violate a constraint."
     # Optuna draws a front of two or three objectives.
     if len(objectives) in (2, 3):
         figure = plot_pareto_front(study, target_names=list(map(title_of, objectives)))
         said = "Red: trials that no other is better than. Blue: the other trials that have run to their end."
-        said += "" if all(map(is_feasible, complete)) else " Grey: trials that violate a constraint."
+        said += f" Grey: {violating}" if violating else ""
         yield _titled("Pareto front", figure.update_layout(height=HEIGHT_PX), said)
     for number, (objective, direction) in enumerate(zip(objectives, study.directions, strict=True)):
         title = html.escape(title_of(objective))
@@ -68,13 +69,12 @@ def charts_of(
             yield _titled(f"Importance of each key: {title}", _importance(rows), _on_importance(len(complete)))
         keys = list(dict.fromkeys(key for trial in complete for key in trial.params))
         drawn = "".join(chart(_slice(complete, key, number, objective)) for key in keys)
-        violating = "" if all(map(is_feasible, complete)) else "trials violate a constraint."
-        said = f"<p>Grey {violating}</p>" if violating else ""
+        said = f"<p>Grey: {violating}</p>" if violating else ""
         yield f'<h2>Slices of the space: {title}</h2>{said}<div class="charts">{drawn}</div>'
         figure = plot_parallel_coordinate(_alone(complete, number, direction), target_name=title_of(objective))
         # The scale ends in white.
         figure.update_layout(height=HEIGHT_PX, plot_bgcolor="#d0d0d0")
-        said = f"Darker is better.{f' Dotted {violating}' if violating else ''}"
+        said = f"Darker is better.{f' Dotted: {violating}' if violating else ''}"
         yield f"<h2>Parallel coordinates: {title}</h2><p>{said}</p>{chart(figure, is_wide=True)}"
 
 

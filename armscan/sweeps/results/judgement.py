@@ -75,9 +75,7 @@ class Difference(NamedTuple):
     def verdict(self) -> str:
         """Return `better` or `worse` according to the interval; empty if it includes 0, or there is none."""
         above, below = ("better", "worse") if self.is_higher_better else ("worse", "better")
-        if self.is_constant:
-            return ""
-        return above if self.paired.low > 0 else below if self.paired.high < 0 else ""
+        return above if self.estimate.low > 0 else below if self.estimate.high < 0 else ""
 
     def row(self) -> dict[str, str]:
         """Return its row of a table: cells by column."""

@@ -1,4 +1,4 @@
-"""Check the attributes and values of a stored study on each read: an untrusted storage may hold any."""
+"""Check the attributes and values of a stored study on each read: an untrusted storage may hold anything."""
 
 from __future__ import annotations
 

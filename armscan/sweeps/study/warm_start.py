@@ -139,7 +139,7 @@ def values_of(space: Space, overrides: Sequence[str]) -> tuple[dict[str, Value],
 def _of_study(
     settings: StudySettings, name: str, fixed: Mapping[str, Any], storage: Storage | None, known: Collection[str]
 ) -> InitialTrials:
-    """Return the initial trials from another study, without those at `known` places, which the study has already."""
+    """Return the initial trials from another study, except those that this study has, at `known` places."""
     source, wanted = _source(settings, name, storage), comparable_settings(settings, fixed)
     trials = [trial for trial in source.get_trials(deepcopy=False) if trial.state in FINISHED]
     difference = _difference(source, wanted)
@@ -235,7 +235,7 @@ def first_different(settings: Iterable[dict[str, Value]]) -> tuple[dict[str, Val
 
 
 def _place(name: str, trial: FrozenTrial) -> str:
-    """Return the study and number that a trial of a study first had."""
+    """Return where a trial was first run: the study, and its number there."""
     return str(trial.user_attrs.get(TAKEN_FROM, f"{name}:{trial.number}"))
 
 

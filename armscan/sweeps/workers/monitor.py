@@ -51,7 +51,7 @@ class StudyMonitor:
         )
 
     def is_worked_on(self) -> bool:
-        """Return whether the worker of any running trial is alive and, by its clock, has renewed its lease lately."""
+        """Return whether a running trial has a live worker that has renewed its lease within `LIFELESS_S`."""
         now_s = time.time()
         return any(
             now_s - trial.user_attrs.get(LEASE, {}).get(BEAT_S, 0.0) < LIFELESS_S

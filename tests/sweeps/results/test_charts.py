@@ -34,8 +34,8 @@ def test_trials_that_violate_a_constraint_are_drawn_as_such():
     assert slice_.marker.color == (BLUE, GREY)
     for trials, is_said in ((study.trials, True), (study.trials[:1], False)):
         shown = "".join(charts_of(study, trials, ["mean_steps"], []))
-        assert ("Grey trials violate a constraint." in shown) == is_said
-        assert ("Dotted trials violate a constraint." in shown) == is_said
+        assert ("Grey: trials that violate a constraint." in shown) == is_said
+        assert ("Dotted: trials that violate a constraint." in shown) == is_said
     assert '"dash":"dot"' in "".join(charts_of(study, study.trials, ["mean_steps"], []))
 
 
