@@ -32,12 +32,12 @@ from armscan.launch.folds_grid import with_folds
 from armscan.launch.grid_plan import check_grid, print_grid_plan
 from armscan.launch.job_process import start_job
 from armscan.launch.launchers import ON_THIS_MACHINE, launcher_error
-from armscan.launch.multirun import Multirun, end_multirun, print_resume_command
+from armscan.launch.multirun import Multirun, end_grid, print_resume_command
 from armscan.utils.log import silence_libraries
 
 
 def run(config: DictConfig) -> None:
-    """Run a configuration composed by Hydra: a single run, a job of a multirun, or a worker of a study."""
+    """Run a configuration composed by Hydra: a single run, a job of a grid, or a worker of a study."""
     if config.get("study") is not None:
         # Deferred, because only studies need Optuna.
         from armscan.sweeps.study.arguments import trial_overrides
@@ -103,9 +103,9 @@ def repeat_grid(words: Sequence[str], run_id: str, *, trust: bool) -> None:
 
 
 def _end_interrupted() -> None:
-    """Close a multirun that was interrupted; a second interrupt leaves that to `armscan runs sync`."""
+    """Close a grid that was interrupted; a second interrupt leaves that to `armscan runs sync`."""
     try:
-        end_multirun(is_interrupted=True)
+        end_grid(is_interrupted=True)
     except (KeyboardInterrupt, Exception) as error:
         if not is_interruption(error):
             raise
@@ -155,10 +155,10 @@ def main() -> int:
     except (KeyboardInterrupt, Exception) as error:
         # An interrupt inside compiled code can surface as any other error.
         if not is_interruption(error):
-            end_multirun()
+            end_grid()
             raise_or_exit(error)
     else:
-        return end_multirun()
+        return end_grid()
     # Not in the handler, where every further error would seem to follow from the interruption.
     _end_interrupted()
     print(INTERRUPTED, file=sys.stderr)

@@ -143,10 +143,10 @@ def test_multirun_runs_its_jobs_as_children_and_a_failed_one_stops_no_other(tmp_
     assert ended.returncode == 1
     assert "Traceback" not in ended.stderr
     assert "success_threshold is 7, but it must be a finite number above 0 and at most 1" in ended.stderr
-    assert "again alone: python -m armscan.run obs=cluster env.success_threshold=7" in ended.stderr
+    assert "run it alone with: python -m armscan.run obs=cluster env.success_threshold=7" in ended.stderr
     assert "all runs  armscan ui\n" in ended.stdout
     tracked = runs_in(tmp_path)[1]
-    (parent,) = [each for each in tracked if each.info.run_name.startswith("multirun")]
+    (parent,) = [each for each in tracked if each.info.run_name.startswith("grid")]
     assert f"compare   armscan report --runs {parent.info.run_id}\n" in ended.stdout
     children = [each for each in tracked if each is not parent]
     assert parent.info.status == "FAILED"
@@ -166,9 +166,9 @@ def test_multirun_runs_its_jobs_as_children_and_a_failed_one_stops_no_other(tmp_
     assert again.returncode == 1
     # What has finished is not run again; what failed is.
     assert again.stdout.count("has finished before: run") == 2
-    assert again.stdout.count("again alone") + again.stderr.count("again alone") == 2
+    assert again.stdout.count("run it alone") + again.stderr.count("run it alone") == 2
     runs = runs_in(tmp_path)[1]
-    parents = [each for each in runs if each.info.run_name.startswith("multirun")]
+    parents = [each for each in runs if each.info.run_name.startswith("grid")]
     assert len(runs) == len(parents) + 2 == 4
     new_parent = next(each for each in parents if each.info.run_id != parent.info.run_id)
     adopted = [each.data.tags["mlflow.parentRunId"] for each in runs if each not in parents]
@@ -185,7 +185,7 @@ def test_folds_are_a_grid_with_one_table_over_all_of_them(tmp_path, data_folder)
     ended = armscan_run(*words, cwd=tmp_path)
     assert ended.returncode == 0, ended.stderr
     tracked = runs_in(tmp_path)[1]
-    (parent,) = [each for each in tracked if each.info.run_name.startswith("multirun")]
+    (parent,) = [each for each in tracked if each.info.run_name.startswith("grid")]
     children = [each for each in tracked if each is not parent]
     assert len(children) == 2
     table = ended.stdout[ended.stdout.index("all folds (test)") :]
@@ -418,7 +418,7 @@ def test_job_that_is_ended_takes_no_other_with_it(tmp_path, ending, line, of_gri
     assert process.wait(HANG_S) == 1
     output = (tmp_path / "printed").read_text()
     assert output.count(line) == 1
-    assert ("again alone: python -m armscan.run seed=" in output) is (ending == signal.SIGKILL)
+    assert ("run it alone with: python -m armscan.run seed=" in output) is (ending == signal.SIGKILL)
     assert "resume all with: " in output
     assert "Traceback" not in output
     assert sorted(each.info.status for each in runs_in(tmp_path)[1]) == of_grid

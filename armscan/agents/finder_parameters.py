@@ -35,8 +35,8 @@ class FinderParameters:
     """See `Parameters.SCHEDULABLE`."""
 
     offsets_mm: Sequence[float] = (9.0, -9.0, 0.0)
-    """Offset of the next look along the normal from the plane found so far, in mm, after each look and at the start:
-    2 to 20 numbers from -100 to 100. The last is 0: the answer.
+    """Offset of the next plane from the plane found so far, along its normal, in mm; one after each look, the start
+    included: 2 to 20 numbers from -100 to 100. The last is 0: the answer.
     """
 
     n_seen: int = 3

@@ -59,10 +59,10 @@ class PlaneFinderLearner(SupervisedLearner):
         setup.compute.apply_to(network)
         self._calibration_envs = setup.make_validation_envs and setup.make_validation_envs(N_CALIBRATION)
         self.expected_error: tuple[float, float] | None = None
-        """Expected errors of the plane that `act` chose last, in mm and degrees; None before the first, and if SAC has
-        corrected the plane."""
+        """Expected errors of the plane found so far, at the latest `act`, in mm and degrees; None before it, and if SAC
+        corrects planes."""
         self.expected_errors: NDArray[Any] = np.empty((0, 2))
-        """Expected errors of the planes that `act_all` chose last in each episode, shape (n, 2); None for an episode
+        """Expected errors of the planes found so far, at the latest `act_all`, shape (n, 2); None for an episode
         without."""
 
     @property

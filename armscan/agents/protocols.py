@@ -53,7 +53,7 @@ class Learner(Agent, Protocol):
 
     @property
     def env_steps_at_once(self) -> int:
-        """The fewest environment steps that `learn` can take."""
+        """Environment steps that budgets and epochs are rounded up to."""
 
     @property
     def update_note(self) -> str | None:

@@ -89,7 +89,7 @@ def list_runs(form: str, children: bool, tracking: str, sort: str, limit: int | 
         if not rows and form == "table":
             print(f"no run of {client.uri} is selected")
         else:
-            write_rows([each for row in rows for each in row.unfolded()] if children else rows, form)
+            write_rows([each for row in rows for each in row.expanded()] if children else rows, form)
 
 
 @runs.command(epilog=examples("runs show 3bf2"))
@@ -151,10 +151,10 @@ def prune(what: str, apply: bool, tracking: str, sort: str, limit: int | None, *
 def stop(target: str, storage: str, tracking: str) -> None:
     """Stop a trial, a study, or a run of this machine.
 
-    STUDY is the name of a study: its trials are requeued at their next report, and the command that started it resumes
-    it.
-    RUN is an MLflow run ID or its first characters. A trial ends at its next report, as pruned, and counts
-    as finished; a run outside a study is interrupted as by Ctrl-C.
+    STUDY is the name of a study: its trials are requeued within ten seconds and an epoch, and the
+    command that started it resumes it.
+    RUN is an MLflow run ID or its first characters. A trial ends likewise, as pruned, and counts as finished; a run
+    outside a study is interrupted as by Ctrl-C.
     """
     from armscan.runs.stop import interrupt, target_of
     from armscan.sweeps.stop import check_tracked, is_study, stop_study, stop_trial

@@ -27,7 +27,7 @@ def choices() -> dict[str, dict[str, Path]]:
 
 
 def summary(path: Path) -> str:
-    """Return the first sentence of a file's leading comment."""
+    """Return the first sentence of a file's leading comment, cut to 100 characters."""
     lines = []
     for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
         if not line.startswith("#"):

@@ -23,13 +23,13 @@ UV_RUN = "UV_RUN_RECURSION_DEPTH"
 
 @cache
 def typed(program: str) -> tuple[str, ...]:
-    """Return the words that start a program of this Python's environment from the working folder."""
+    """Return the words that start a program of this Python's environment, from the folder of the command."""
     if UV_RUN in os.environ:
         return "uv", "run", program
     file, found = Path(sys.executable).with_name(program), shutil.which(program)
     if not file.exists() or (found is not None and Path(found).parent.samefile(file.parent)):
         return (program,)
-    return (str(file.relative_to(here) if file.is_relative_to(here := Path.cwd()) else file),)
+    return (str(file.relative_to(STARTED_IN) if file.is_relative_to(STARTED_IN) else file),)
 
 
 def kept_command(words: Iterable[str]) -> str:

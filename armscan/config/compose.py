@@ -127,11 +127,11 @@ def config_loader() -> Iterator[ConfigLoader]:
 
 def compose_run(words: Sequence[str]) -> tuple[DictConfig, dict[str, str]]:
     """Return the configuration of a run, without the section of a study, and the choice of each group."""
-    return of_run(compose(words, return_hydra_config=True))
+    return reduce_to_run(compose(words, return_hydra_config=True))
 
 
-def of_run(config: DictConfig) -> tuple[DictConfig, dict[str, str]]:
-    """Return the part of a composed configuration that describes a run, and the choice of each group."""
+def reduce_to_run(config: DictConfig) -> tuple[DictConfig, dict[str, str]]:
+    """Remove from a composed configuration what does not describe a run; return it, and the choice of each group."""
     choices = {str(group): str(choice) for group, choice in config.hydra.runtime.choices.items()}
     with open_dict(config):
         # Resolved first: its address may come from the section `cluster`, which is removed.

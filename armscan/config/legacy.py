@@ -49,7 +49,7 @@ def migrate(config: Mapping[str, Any]) -> dict[str, Any]:
     """
     env, agent = config.get("env"), config.get("agent")
     target = env.get("_target_") if isinstance(env, Mapping) else config.get("env._target_")
-    # Renamed later than the environment.
+    # Written between the two renamings: the new environment, but the old key.
     is_between = "astray_share" in agent if isinstance(agent, Mapping) else "agent.astray_share" in config
     return renamed(config) if target == OLD_ENV or is_between else dict(config)
 

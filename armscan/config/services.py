@@ -18,7 +18,7 @@ from armscan.errors import InvalidValueError, listed
 STORAGE, TRACKING = "storage", "tracking_uri"
 VARIABLES = {STORAGE: "ARMSCAN_STORAGE", TRACKING: "MLFLOW_TRACKING_URI"}
 RESOLVER = "armscan.service"
-# Ports of `armscan ui` on 127.0.0.1. The notes of trials link to the first.
+# Ports of `armscan ui` on 127.0.0.1. The notes of studies and trials link to the first.
 MLFLOW_PORT, DASHBOARD_PORT = 5000, 8080
 
 

@@ -10,7 +10,7 @@ SEEN = ("env.observation", "env.stack", "env.stack_exclude", "env.stack_memory",
 # Deformations of the training volumes alone.
 OF_TRAINING = tuple(f"env.transform.{name}" for name in ("scale", "stretch", "shear", "mirror"))
 # Keys of the data that leave the test volumes as they are.
-NOT_TESTED_ON = ("data.cache_dir", "data.n_training")
+NOT_TESTED_ON = ("data.cache_dir", "data.first_seed", "data.n_training", "data.n_validation")
 
 
 def is_under(key: str, sections: Iterable[str]) -> bool:

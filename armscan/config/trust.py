@@ -47,12 +47,13 @@ def _classes_in(files: Iterable[Path]) -> set[str]:
 
 
 def stored_config(config: Mapping[str, Any], *, where: str, trust: bool) -> dict[str, Any]:
-    """Return a stored configuration with the keys and classes of this version, and the user's own cache.
+    """Return a stored configuration with the keys and classes of this version.
 
     Args:
         config: Resolved configuration, as it was stored.
         where: Owner of the configuration, such as `run 3bf2`, for the error.
-        trust: Whether the configuration may name classes that armscan does not offer (`--trust`).
+        trust: Whether to keep foreign classes, interpolations and its `data.cache_dir` (`--trust`). Otherwise the
+            user's own cache is used.
 
     Raises:
         UntrustedError: If it names a class that armscan does not offer, or holds an interpolation.
@@ -82,7 +83,7 @@ def check_composed(config: Mapping[str, Any], *, where: str) -> None:
 
 
 def needs_trust(config: Mapping[str, Any]) -> bool:
-    """Return whether a run with this configuration, or these MLflow parameters, can be read only with `--trust`."""
+    """Return whether a run with this configuration, or these MLflow parameters, can be built only with `--trust`."""
     return _foreign_part(migrate(config), offered_classes()) is not None
 
 

@@ -19,7 +19,7 @@ from armscan.training.episode_seeds import EVALUATION_SEED
 from armscan.utils.console import print_sentence
 from armscan.volumes import LabelVolume, ManipulatorAction
 
-# Places along the arm, as fractions of its length, where a plane may show something.
+# Values of ty, as fractions of its range, at which a plane may show something.
 PLACES = (0.5, 0.4, 0.6, 0.3, 0.7, 0.2, 0.8)
 
 
@@ -90,6 +90,4 @@ class AgentSearch:
             plane = ManipulatorAction((0.0, 0.0), (0.0, place * along_mm))
             if scorer.score(plane)[0] > -1.0:
                 return replace(volume, optimal_action=plane)
-        raise OptimalPlaneError(
-            f"{volume.name}: the agent's environment sees nothing at {len(PLACES)} places of the arm"
-        )
+        raise OptimalPlaneError(f"{volume.name}: the agent's environment sees nothing at {len(PLACES)} values of ty")

@@ -49,7 +49,7 @@ class EvaluationReport:
 
     Args:
         evaluations: Evaluations by the name of their volumes, such as `test volumes`.
-        has_total: Whether to pool all evaluations too; False if the agent was trained on some of the volumes.
+        has_total: Whether to pool all evaluations too; False unless they are new to the agent's run.
         facts: Agent, data and settings of the evaluation, as plain values for the JSON file.
         baselines: Episodes of the baselines, by their names, then by the name of the volumes. Default: none.
     """

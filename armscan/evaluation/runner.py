@@ -31,6 +31,7 @@ from armscan.training.domain import smallest_slice
 from armscan.training.episode_results import Env
 from armscan.training.episode_seeds import EVALUATION_SEED
 from armscan.utils.console import print_sentence
+from armscan.utils.text import counted
 
 PIXEL_TOLERANCE = 0.1
 
@@ -45,7 +46,8 @@ class PreparedAgent:
         envs: Environments by the name of their volumes.
         notes: Differences from its training, one sentence each.
         data: Folder of the volumes, `phantom`, or None for the volumes of the agent's own configuration.
-        is_new: Whether the agent's run has used none of the volumes. Default: False.
+        is_new: Whether the agent's run has used neither the volumes nor others of their names or subjects.
+            Default: False.
         own: Names of those environments that have volumes which the agent's run has used, by their contents. Default:
             none.
     """
@@ -75,7 +77,8 @@ class PreparedAgent:
         baselines: dict[str, dict[str, Evaluation]] = {}
         on_plane = on_plane_of(self.source.config)
         for label, env in self.envs.items():
-            tell(f"playing {n_episodes} episodes on {len(env.get_wrapper_attr('volumes'))} {label}")
+            n_volumes = len(env.get_wrapper_attr("volumes"))
+            tell(f"playing {counted(n_episodes, 'episode')} on {label} ({counted(n_volumes, 'volume')})")
             how = {"n_episodes": n_episodes, "seed": EVALUATION_SEED + seed}
             evaluations[label] = evaluate(self.agent, env, **how, on_plane=on_plane)
             for name, evaluation in evaluate_baselines(env, **how, on_plane=on_plane).items():

@@ -92,6 +92,6 @@ def make_algorithm(config: DictConfig) -> Algorithm:
     algorithm: Algorithm = instantiate(config.agent, _convert_="object")
     if not callable(getattr(algorithm, "agent", None)):
         raise InvalidValueError(
-            f"agent is {algorithm!r}, but it must have the method of Algorithm, agent: give agent._target_ such a class"
+            f"agent is {algorithm!r}, but it has no method agent: agent._target_ must name an Algorithm"
         )
     return algorithm

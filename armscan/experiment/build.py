@@ -40,8 +40,8 @@ TRACKING_KEYS = ("uri", "experiment", "artifacts", "wait_s", "system_metrics_s",
 
 
 @dataclass(frozen=True, kw_only=True)
-class Experiment:
-    """An experiment, built from its configuration.
+class RunSetup:
+    """The parts of a run, built from its configuration.
 
     Args:
         split: Volumes by split.
@@ -96,27 +96,27 @@ class Experiment:
         return CheckpointProvenance(run_id=run_id, volumes=self.fingerprints)
 
 
-def set_up(config: DictConfig) -> Experiment:
-    """Build an experiment with the environments of its evaluations, and check them, before tracking starts.
+def set_up(config: DictConfig) -> RunSetup:
+    """Build the setup of a run with the environments of its evaluations, and check them, before tracking starts.
 
     Raises:
         InvalidValueError: If a value is not allowed, or the agent cannot act in one of the environments.
     """
     silence_libraries()
-    experiment = build_experiment(config)
-    envs = (experiment.training_env, experiment.validation_env, experiment.test_env, experiment.video_env)
+    setup = build_setup(config)
+    envs = (setup.training_env, setup.validation_env, setup.test_env, setup.video_env)
     trained = TrainingDomain.of(envs[0])
     for env in envs[1:]:
         trained.check_observed(TrainingDomain.of(env))
-    if not isinstance(experiment.agent, Learner):
+    if not isinstance(setup.agent, Learner):
         # Checks the number of planes of a sweep, which depends on the sizes of the volumes.
         for bounds in {bounds for env in envs for bounds in env.get_wrapper_attr("rules").bounds.values()}:
-            experiment.agent.begin(seed=0, bounds=bounds)
-    return experiment
+            setup.agent.begin(seed=0, bounds=bounds)
+    return setup
 
 
-def build_experiment(config: DictConfig, split: Split | None = None) -> Experiment:
-    """Build an experiment from its composed configuration; without `split`, the volumes are read too."""
+def build_setup(config: DictConfig, split: Split | None = None) -> RunSetup:
+    """Build the setup of a run from its composed configuration; without `split`, the volumes are read too."""
     check_config(config)
     budget = build_section(config, "training", Budget)
     split = split or build_section(config, "data", Split)
@@ -131,7 +131,7 @@ def build_experiment(config: DictConfig, split: Split | None = None) -> Experime
         validation=split.validation,
         schedule=budget.segments,
     )
-    return Experiment(
+    return RunSetup(
         split=split,
         env_factory=env_factory,
         agent=agent,
@@ -144,16 +144,16 @@ def build_experiment(config: DictConfig, split: Split | None = None) -> Experime
     )
 
 
-def check_episodes(experiment: Experiment) -> None:
+def check_episodes(setup: RunSetup) -> None:
     """Check that a new run validates and tests on each of its volumes.
 
     Raises:
         InvalidValueError: If it has fewer episodes than volumes.
     """
-    check_each_seen("evaluation.episodes", experiment.n_episodes, "test", experiment.split)
-    if isinstance(experiment.agent, Learner):
-        budget = experiment.budget
-        check_each_seen("training.validation_episodes", budget.validation_episodes, "validation", experiment.split)
+    check_each_seen("evaluation.episodes", setup.n_episodes, "test", setup.split)
+    if isinstance(setup.agent, Learner):
+        budget = setup.budget
+        check_each_seen("training.validation_episodes", budget.validation_episodes, "validation", setup.split)
 
 
 def check_each_seen(key: str, n_episodes: int, part: str, split: Split) -> None:

@@ -43,7 +43,7 @@ def print_result_table(
 
 
 def print_jobs(outcomes: Mapping[str, JobOutcome], run_ids: Mapping[str, str], *, have_same_task: bool) -> ResultTable:
-    """Print the table of a multirun's jobs, and return it.
+    """Print the table of a grid's jobs, and return it.
 
     Args:
         outcomes: Outcome of each job, by its number.
@@ -57,7 +57,7 @@ def print_jobs(outcomes: Mapping[str, JobOutcome], run_ids: Mapping[str, str], *
 
 
 def jobs_table(outcomes: Mapping[str, JobOutcome], run_ids: Mapping[str, str], *, have_same_task: bool) -> ResultTable:
-    """Return the table of a multirun's jobs, with the baselines below them; see `print_jobs`."""
+    """Return the table of a grid's jobs, with the baselines below them; see `print_jobs`."""
     figures = {
         number: {name: MetricEstimates.of_metrics(metrics) for name, metrics in outcome.metrics.items()}
         for number, outcome in outcomes.items()
@@ -91,7 +91,7 @@ def print_where_to_look(
     """Print where the results lie, and the command that opens the UI over all runs.
 
     Args:
-        folder: Folder of the run or multirun.
+        folder: Folder of the run or grid.
         tracking_uri: MLflow tracking URI.
         storage: Optuna storage of the study. Default: None, no study.
         files: Files worth looking at, relative to the folder. Default: the folder itself.

@@ -1,6 +1,6 @@
-"""The invocation of a run: its folder, its overrides, and its job of a multirun.
+"""The invocation of a run: its folder, its overrides, and its job of a grid.
 
-It has no slow imports, because a multirun's launcher imports it for every job.
+It has no slow imports, because a grid's launcher imports it for every job.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class JobOutcome:
         overrides: All overrides of the job.
         varied: Overrides that differ from those of the other jobs.
         failure: Reason of its failure; None if it succeeded.
-        metrics: Metrics of its evaluations, by the name of their volumes.
+        metrics: Metrics by the names of the agent's volumes and of the baselines.
     """
 
     overrides: str
@@ -47,16 +47,16 @@ class JobOutcome:
 
 @dataclass(frozen=True)
 class Job:
-    """One job of a multirun, as its own process sees it.
+    """One job of a grid, as its own process sees it.
 
     Args:
         number: Number of the job, from 0.
         overrides: All overrides of the job, as one would type them to run it alone.
         varied: Overrides that differ from those of the other jobs.
         parent_run_id: MLflow run ID of its parent run.
-        folder: Folder of the multirun.
+        folder: Folder of the grid.
         repeats: MLflow run ID of the grid that is repeated without its finished jobs. Default: None, a new grid.
-        is_trusted: Whether it may build any class; false if its words were stored. Default: True.
+        is_trusted: Whether it may build any class; false if its words were stored and not trusted. Default: True.
     """
 
     number: int
@@ -69,7 +69,7 @@ class Job:
 
     @classmethod
     def current(cls) -> Self | None:
-        """Return the job that this process is running, None outside a multirun."""
+        """Return the job that this process is running, None outside a grid."""
         hydra_config = HydraConfig.get()
         if hydra_config.mode != RunMode.MULTIRUN:
             return None
@@ -87,7 +87,7 @@ class Job:
         return f"{self.number} {self.varied}".strip()
 
     def claims(self, folder: Path) -> bool:
-        """Return whether this job is the first of its multirun to use a folder, and keep that for the others."""
+        """Return whether this job is the first of its grid to use a folder, and keep that for the others."""
         file = self.folder / OUTCOME_FOLDER / f"{sha256(str(folder).encode())}.folder"
         with contextlib.suppress(FileExistsError), file.open("x") as opened:
             opened.write(str(self.number))
@@ -110,7 +110,7 @@ class Invocation:
         overrides: Overrides on the command line.
         command: Command line; for a job, the one that repeats it alone.
         choices: Choice of each configuration group.
-        job: Job of a multirun; None for a single run.
+        job: Job of a grid; None for a single run.
     """
 
     folder: Path

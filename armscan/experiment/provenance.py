@@ -15,7 +15,7 @@ from omegaconf import DictConfig
 
 import armscan
 from armscan.config.defaults import CHOICES, to_plain
-from armscan.experiment.build import Experiment
+from armscan.experiment.build import RunSetup
 from armscan.experiment.job import Invocation
 from armscan.tracking import (
     TrackedRun,
@@ -26,7 +26,17 @@ from armscan.tracking import (
     tags_of,
     upload_pending,
 )
-from armscan.tracking.tags import CHOICE, DOMAIN_TAG, FOLDER_TAG, HOST_TAG, JOB_TAG, SUBJECTS, VERSION_TAG, VOLUMES
+from armscan.tracking.tags import (
+    CHOICE,
+    DOMAIN_TAG,
+    FOLDER_TAG,
+    HOST_TAG,
+    JOB_TAG,
+    OVERRIDES_TAG,
+    SUBJECTS,
+    VERSION_TAG,
+    VOLUMES,
+)
 from armscan.training import TrainingDomain
 from armscan.utils.files import atomic_write, sha256
 from armscan.utils.run_files import (
@@ -48,7 +58,7 @@ N_PRINT_CHARS = 16
 def start_tracking(
     config: DictConfig,
     invocation: Invocation,
-    setup: Experiment,
+    setup: RunSetup,
     *,
     tags: Mapping[str, str] | None = None,
     retry_s: float | None = None,
@@ -82,7 +92,7 @@ def start_tracking(
             **environment_tags(),
             "command": invocation.command,
             "seed": str(resolved["seed"]),
-            "overrides": " ".join(invocation.overrides),
+            OVERRIDES_TAG: " ".join(invocation.overrides),
             **{f"{CHOICE}{group}": choices[group] for group in CHOICES},
             **volume_tags(setup),
             # On other volumes, an evaluation must reproduce the agent's observations.
@@ -114,8 +124,8 @@ def _remove_earlier(folder: Path) -> None:
     shutil.rmtree(folder / POLICY_FOLDER, ignore_errors=True)
 
 
-def provenance_files(config: dict[str, Any], setup: Experiment) -> dict[str, bytes]:
-    """Return the files that describe a run's origin, by their names: configuration, volumes, code."""
+def provenance_files(config: dict[str, Any], setup: RunSetup) -> dict[str, bytes]:
+    """Return the files that describe a run's origin, by their names: configuration, volumes, packages, code."""
     diff = code_state().diff
     return {
         CONFIG_FILE: yaml.safe_dump(config, sort_keys=False).encode(),
@@ -130,7 +140,7 @@ def sha256_tags(files: Mapping[str, bytes]) -> dict[str, str]:
     return {tag: sha256(files[name]) for name, tag in SHA256_TAGS.items()}
 
 
-def volume_tags(setup: Experiment) -> dict[str, str]:
+def volume_tags(setup: RunSetup) -> dict[str, str]:
     """Return the names of the volumes, each with the beginning of its fingerprint, and subjects as tags of a run."""
     names = {
         f"{VOLUMES}{part}": " ".join(f"{name}:{each[:N_PRINT_CHARS]}" for name, each in volumes.items())

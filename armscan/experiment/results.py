@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path
 
 from armscan.agents.baselines import RandomAgent
-from armscan.experiment.build import Experiment
+from armscan.experiment.build import RunSetup
 from armscan.reports.html import page
 from armscan.training import (
     TEST,
@@ -69,11 +69,11 @@ class RunResult:
     own_baseline: str | None = None
 
     @classmethod
-    def of(cls, setup: Experiment, result: TrainingResult | None) -> RunResult:
+    def of(cls, setup: RunSetup, result: TrainingResult | None) -> RunResult:
         """Play the final evaluations of a setup's agent, and the baselines on its test volumes.
 
         Args:
-            setup: Experiment, whose agent has the weights to evaluate.
+            setup: Setup of the run, whose agent has the weights to evaluate.
             result: Result of the training; None for an agent that does not learn.
         """
         agent, seed, n_episodes, on_plane = setup.agent, setup.seed, setup.n_episodes, setup.on_plane

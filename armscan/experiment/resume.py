@@ -102,7 +102,7 @@ def _tag(run: Run, name: str) -> str:
     try:
         return str(run.data.tags[name])
     except KeyError as error:
-        raise ResumeError(f"run {run.info.run_id} has no tag {name}, as each run of armscan run has") from error
+        raise ResumeError(f"run {run.info.run_id} has no tag {name}, which every run of armscan run has") from error
 
 
 def _check_grid(run: Run, words: Sequence[str], uri: str) -> None:
@@ -121,7 +121,7 @@ def _check_grid(run: Run, words: Sequence[str], uri: str) -> None:
 def resume_run(
     client: TrackingStore, run_id: str, *, job_label: str | None = None, trust: bool = False
 ) -> dict[str, dict[str, float]]:
-    """Resume a run; see `resume`. The printed lines of a multirun's job begin with its label."""
+    """Resume a run; see `resume`. The printed lines of a grid's job begin with its label."""
     run = client.get_run(run_id)
     client.check_artifacts_of(run)
     folder = _folder_of(run)

@@ -12,7 +12,7 @@ from omegaconf import DictConfig
 
 from armscan.agents import Learner
 from armscan.config.command_hints import armscan_command, resume_command
-from armscan.experiment.build import Experiment, check_effects, check_episodes, check_keys, set_up
+from armscan.experiment.build import RunSetup, check_effects, check_episodes, check_keys, set_up
 from armscan.experiment.console import print_result_table, print_where_to_look
 from armscan.experiment.job import Invocation
 from armscan.experiment.provenance import start_tracking
@@ -53,7 +53,7 @@ def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict
     """Train (if it is a `Learner`), evaluate and track an agent.
 
     Returns:
-        The metrics of the final evaluations, by the name of their volumes.
+        The metrics, by the names of the agent's volumes and of the baselines.
     """
     check_keys(config)
     check_effects(config, invocation.overrides)
@@ -70,7 +70,7 @@ def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict
 
 
 def run_tracked(
-    setup: Experiment,
+    setup: RunSetup,
     tracked: TrackedRun,
     folder: Path,
     tracking_uri: str,
@@ -81,15 +81,15 @@ def run_tracked(
     """Train, evaluate and print results in a tracked run.
 
     Args:
-        setup: Experiment to run.
+        setup: Setup of the run.
         tracked: Run that tracks it.
         folder: Folder of the run's files.
         tracking_uri: MLflow tracking URI.
-        job_label: Prefix of the printed lines of a multirun's job. Default: None, a single run.
+        job_label: Prefix of the printed lines of a grid's job. Default: None, a single run.
         earlier: Epochs before the interruption of a resumed training. Default: none.
 
     Returns:
-        The metrics of the final evaluations, by the name of their volumes.
+        The metrics, by the names of the agent's volumes and of the baselines.
     """
     before = f"[{job_label}] " if job_label else ""
 
@@ -148,7 +148,7 @@ def _tell_validation_interval(learner: Learner, budget: Budget, tell: Callable[[
 
 
 def train_agent(
-    setup: Experiment,
+    setup: RunSetup,
     folder: Path,
     callbacks: Sequence[Callback],
     *,

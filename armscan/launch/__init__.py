@@ -1,1 +1,1 @@
-"""Several runs: multiruns, job processes, launchers."""
+"""Several runs: grids, job processes, launchers."""

@@ -22,7 +22,7 @@ def with_folds(words: Sequence[str]) -> list[str]:
     Other keys that the grid varies, such as `seed=0,1,2`, stay.
 
     Raises:
-        InvalidValueError: If there are no such folds.
+        InvalidValueError: If the folds are not allowed or vary, or `data.path` or `data.test` contradicts them.
         ArmscanError: If the folder of the volumes cannot be read.
     """
     overrides = [word for word in words if not word.startswith("-")]

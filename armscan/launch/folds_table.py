@@ -18,7 +18,7 @@ AGENT = f"agent{ALL_FOLDS}"
 
 
 def folds_table(runs: Iterable[tuple[Path, Sequence[str]]], n_folds: int | None = None) -> ResultTable | None:
-    """Return one table over the folds of a grid, with the baselines; None if it is not a grid of folds.
+    """Return one table over the folds of a grid, with the baselines; None if it has none.
 
     Every subject is tested once for each seed, so that intervals resample subjects, as those of one run do.
 

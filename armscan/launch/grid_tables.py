@@ -45,7 +45,7 @@ def keep_tables(
     runs: Sequence[Run],
     store: TrackingStore,
 ) -> None:
-    """Save the table of the jobs and the one over all folds; an error is only printed, because the grid has ended."""
+    """Save the table of the jobs, or print and save the one over all folds; only print an error: the grid has ended."""
     from mlflow.exceptions import MlflowException
 
     try:

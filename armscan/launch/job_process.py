@@ -1,4 +1,4 @@
-"""One job of a multirun, in its own process, started by the launcher's."""
+"""One job of a grid, in its own process, started by the launcher's."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def start_job(config: DictConfig, invocation: Invocation, job: Job) -> None:
 
 
 def run_job(launcher_pid: int) -> None:
-    """Run one job of a multirun, passed on standard input; a failure is recorded and does not stop the others.
+    """Run one job of a grid, passed on standard input; a failure is recorded and does not stop the others.
 
     Args:
         launcher_pid: Process ID of its launcher.

@@ -42,7 +42,7 @@ def launcher_error(name: str, error: Exception) -> ArmscanError:
 
 
 def prepare_launcher(name: str) -> None:
-    """Keep a launcher's messages about waiting off the screen, and the Slurm job of this process out of its jobs."""
+    """Hide submitit's warnings about missing accounting, and keep this process's Slurm job out of its jobs."""
     if name == SLURM:
         # Without Slurm accounting, submitit warns again and again. Its import sets the level, so it comes first.
         import submitit

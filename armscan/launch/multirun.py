@@ -54,7 +54,7 @@ class Multirun(Callback):
     launcher: str | None = None
     # Of the parent run; open while the jobs run.
     outbox: Outbox | None = None
-    # Run ID of the grid that this multirun repeats without its finished jobs, and whether they may build any class.
+    # Run ID of the grid that this one repeats without its finished jobs, and whether they may build any class.
     repeats: str | None = None
     is_trusted = True
 
@@ -104,7 +104,7 @@ class Multirun(Callback):
             "working_folder": str(Path.cwd()),
             GRID_TAG: json.dumps(again),
         }
-        run = client.create_run(experiment_id, name=f"multirun {command}"[:250], tags=tags)
+        run = client.create_run(experiment_id, name=f"grid {command}"[:250], tags=tags)
         parent = {"run_id": run.info.run_id, "tracking": tracking, "overrides": overrides, "common": _common(overrides)}
         parent |= {"repeats": Multirun.repeats, "is_trusted": Multirun.is_trusted}
         # Also if it was resumed with --trust.
@@ -132,14 +132,14 @@ def _exit_on_error() -> Iterator[None]:
         raise SystemExit(2) from error
 
 
-def end_multirun(*, is_interrupted: bool = False) -> int:
+def end_grid(*, is_interrupted: bool = False) -> int:
     """Close the parent run and print the outcomes of the jobs.
 
     Args:
-        is_interrupted: Whether the multirun was interrupted. Default: False.
+        is_interrupted: Whether the grid was interrupted. Default: False.
 
     Returns:
-        The exit code: 0 if every job succeeded, or if this was not a multirun; 1 otherwise.
+        The exit code: 0 if every job succeeded, or if this was not a grid; 1 otherwise.
     """
     if Multirun.folder is None:
         return 0
@@ -170,7 +170,7 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
             print(f"compare   {compare}")
     for number, outcome in failed.items():
         print(f"job {number} failed: {outcome.failure}", file=sys.stderr)
-        print(f"  again alone: {run_command([])} {outcome.overrides}", file=sys.stderr)
+        print(f"  run it alone with: {run_command([])} {outcome.overrides}", file=sys.stderr)
     if status != "FINISHED":
         _print_resume_commands(parent, runs)
     if store is not None and not runs:
@@ -181,7 +181,7 @@ def end_multirun(*, is_interrupted: bool = False) -> int:
 
 
 def print_resume_command() -> None:
-    """Print the command that resumes a multirun that could not be closed."""
+    """Print the command that resumes a grid that could not be closed."""
     if Multirun.folder is not None:
         parent = json.loads((Multirun.folder / PARENT_FILE).read_text())
         again = resume_command(parent["run_id"], parent["tracking"]["uri"], trust=parent["trust"])

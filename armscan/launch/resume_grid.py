@@ -64,8 +64,8 @@ def run_again(config: DictConfig, invocation: Invocation, job: Job) -> Metrics:
 def earlier_runs(client: TrackingStore, experiment_id: str, sums: Mapping[str, str], job: Job) -> list[Run]:
     """Return the earlier runs of a job: first those of the repeated grid, and each time the latest first.
 
-    The others are single runs, and jobs of grids with the same command line, such as an earlier repetition. Trials of
-    studies, and jobs of other grids, belong to those.
+    Then come single runs, and jobs of grids with the same command line, such as an earlier repetition. Trials of
+    studies and jobs of other grids are left out.
 
     Args:
         client: Store of the runs.
@@ -111,7 +111,7 @@ def _joined(prints: Fingerprints) -> dict[str, str]:
 
 
 def _words_of(grid: Run) -> set[str]:
-    """Return the different words that repeat a grid; a repetition adds some again. None of a run that is no grid."""
+    """Return the words that repeat a grid, each once; empty for a run that is not a grid."""
     with contextlib.suppress(ValueError, TypeError):
         return set(json.loads(grid.data.tags[GRID_TAG])) if GRID_TAG in grid.data.tags else set()
     return set()

@@ -19,7 +19,7 @@ from armscan.tracking import TrackingStore
 from armscan.tracking.histories import History, metric_histories
 from armscan.tracking.run import PRUNED
 from armscan.tracking.store import store_errors
-from armscan.tracking.tags import CHOICE, COMMIT_TAG, PRUNED_TAG, VERSION_TAG
+from armscan.tracking.tags import CHOICE, COMMIT_TAG, OVERRIDES_TAG, PRUNED_TAG, VERSION_TAG
 from armscan.training import TEST, Evaluation
 from armscan.training.fingerprints import Fingerprints, fingerprints_in
 from armscan.training.metric_display import title_of
@@ -181,7 +181,7 @@ def _training(run: Run, histories: Mapping[str, History], files: Mapping[str, by
         series=series,
         evaluation=evaluation if evaluation and evaluation.episodes else None,
         baselines=baselines or {},
-        overridden=frozenset(word.lstrip("+").partition("=")[0] for word in tags.get("overrides", "").split()),
+        overridden=frozenset(word.lstrip("+").partition("=")[0] for word in tags.get(OVERRIDES_TAG, "").split()),
         commit=tags.get(COMMIT_TAG, tags.get(VERSION_TAG)),
         volumes=_parsed(run, files, VOLUMES_FILE, lambda contents: fingerprints_in(contents, VOLUMES_FILE)),
         video=files.get(VIDEO_FILE),

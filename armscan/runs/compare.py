@@ -90,8 +90,15 @@ class Comparison:
         return [told, *(f"  {each}" for each in unlike[:N_SHOWN]), *more]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return it as plain values, ready for JSON; missing measurements are None."""
-        return {"is_same": self.is_same, "metrics": [asdict(each) for each in self.differences]}
+        """Return it as plain values, ready for JSON: missing measurements are None, NaN and infinity strings."""
+        metrics = [
+            {
+                name: str(value) if isinstance(value, float) and not math.isfinite(value) else value
+                for name, value in each
+            }
+            for each in (asdict(each).items() for each in self.differences)
+        ]
+        return {"is_same": self.is_same, "metrics": metrics}
 
 
 def compare_runs(store: TrackingStore, first_id: str, second_id: str) -> Comparison:

@@ -15,7 +15,7 @@ from armscan.config.command_hints import armscan_command
 from armscan.config.defaults import CHOICES
 from armscan.errors import InvalidValueError, TrackingError
 from armscan.evaluation.agent_source import from_its_folder
-from armscan.experiment.build import Experiment, set_up
+from armscan.experiment.build import RunSetup, set_up
 from armscan.experiment.job import Invocation, remove_if_untracked
 from armscan.experiment.provenance import start_tracking
 from armscan.experiment.runner import run_tracked
@@ -24,7 +24,7 @@ from armscan.tracking import FoundRun, code_state, environment_tags, load_agent_
 from armscan.tracking.environment import CONSTRAINTS_SUM, REPORTED_PACKAGES, environment
 from armscan.tracking.git import COMMIT, DIFF_SUM, DIRTY
 from armscan.tracking.sync import ENDED
-from armscan.tracking.tags import CHOICE
+from armscan.tracking.tags import CHOICE, OVERRIDES_TAG
 from armscan.training import check_unchanged
 from armscan.utils.run_files import DIFF_FILE, ENVIRONMENT_FILE, REPRODUCTION_FILE, folder_lock
 
@@ -41,13 +41,13 @@ class Original:
     Args:
         run: Tracked run.
         config: Configuration that it was started with, with absolute paths of files.
-        setup: Experiment that the configuration describes, on the volumes that the run was started with.
+        setup: Setup of a run that the configuration describes, on the volumes that the run was started with.
         environment: Versions that it was computed with; None if they were not kept.
     """
 
     run: FoundRun
     config: DictConfig = field(repr=False)
-    setup: Experiment = field(repr=False)
+    setup: RunSetup = field(repr=False)
     environment: Mapping[str, Any] | None = field(repr=False)
 
 
@@ -96,7 +96,7 @@ def differences(original: Original) -> list[str]:
         )
         lines.append(f"changes since the commit {_changes(tags)}, and {_changes(now)} now{kept}")
     if "resumed" in tags:
-        lines.append(f"the run was cut off and resumed {tags['resumed']} times, which changes no figure by itself")
+        lines.append(f"the run was cut off and resumed (times: {tags['resumed']}), which changes no figure by itself")
     if original.environment is None:
         return [*lines, "the versions of its packages were not kept"]
     before, here = original.environment, environment()
@@ -110,7 +110,7 @@ def differences(original: Original) -> list[str]:
     lines += [line for name, line in changed.items() if name in REPORTED_PACKAGES]
     if others := [name for name in changed if name not in REPORTED_PACKAGES]:
         shown = ", ".join(others[:N_SHOWN]) + (", ..." if len(others) > N_SHOWN else "")
-        lines.append(f"{len(others)} other packages have other versions, or are there in one case only: {shown}")
+        lines.append(f"other packages whose versions differ, or that only one has ({len(others)}): {shown}")
     return lines
 
 
@@ -147,7 +147,7 @@ def reproduce(original: Original, folder: Path, differing: Sequence[str]) -> Com
     is_ours = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
     choices = {group: run.tags.get(f"{CHOICE}{group}", "unknown") for group in CHOICES}
-    overrides = run.tags.get("overrides", "").split()
+    overrides = run.tags.get(OVERRIDES_TAG, "").split()
     uri = original.config.tracking.uri
     command = armscan_command("runs", "reproduce", run.run_id, tracking=uri, trust=original.setup.needs_trust)
     invocation = Invocation(folder, overrides, command, choices, None)

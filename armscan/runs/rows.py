@@ -1,4 +1,4 @@
-"""Row of a list: a run with its figures, and the runs folded into it."""
+"""Row of a list: a run with its figures, and the runs collapsed into it."""
 
 from __future__ import annotations
 
@@ -59,14 +59,14 @@ class RunRow:
         run: Run of the row.
         children: Rows of the selected runs that it started, the earliest first. Default: none.
         depth: Level below the topmost run, 0 or more; 1 for a child shown below its parent. Default: 0.
-        is_folded: Whether its sizes include those of the runs below it. Default: True.
+        is_collapsed: Whether its sizes include those of the runs below it. Default: True.
     """
 
     client: TrackingStore = field(repr=False)
     run: Run
     children: tuple[RunRow, ...] = ()
     depth: int = 0
-    is_folded: bool = True
+    is_collapsed: bool = True
 
     @property
     def below(self) -> list[RunRow]:
@@ -74,26 +74,26 @@ class RunRow:
         return [row for child in self.children for row in (child, *child.below)]
 
     @cached_property
-    def in_folder(self) -> int:
-        """Bytes of its own files in its folder on this machine, and of those folded into it."""
-        n_bytes = sum(child.in_folder for child in self.children) if self.is_folded else 0
+    def folder_bytes(self) -> int:
+        """Bytes of its own files in its folder on this machine, and of those collapsed into it."""
+        n_bytes = sum(child.folder_bytes for child in self.children) if self.is_collapsed else 0
         with contextlib.suppress(RunSkippedError):
             n_bytes += sum(OwnFolder.of(self.run).files().values())
         return n_bytes
 
     @cached_property
-    def in_store(self) -> int | None:
-        """Bytes of its artifacts, and of those folded into it; None if a store cannot be read."""
+    def artifact_bytes(self) -> int | None:
+        """Bytes of its artifacts, and of those collapsed into it; None if a store cannot be read."""
         artifacts = artifacts_of(self.client, self.run)
         parts = [None if artifacts is None else sum(artifacts.values())]
-        parts += [child.in_store for child in self.children if self.is_folded]
+        parts += [child.artifact_bytes for child in self.children if self.is_collapsed]
         known = [part for part in parts if part is not None]
         return sum(known) if len(known) == len(parts) else None
 
     @property
     def n_bytes(self) -> int:
         """All bytes that are known."""
-        return self.in_folder + (self.in_store or 0)
+        return self.folder_bytes + (self.artifact_bytes or 0)
 
     @property
     def started(self) -> datetime:
@@ -127,15 +127,15 @@ class RunRow:
         """Mean steps on the test volumes; None if it was not evaluated."""
         return self.run.data.metrics.get("test_volumes/mean_steps")
 
-    def unfolded(self, depth: int = 0) -> Iterator[RunRow]:
+    def expanded(self, depth: int = 0) -> Iterator[RunRow]:
         """Yield the row and those below it, each below its parent."""
-        yield replace(self, depth=depth, is_folded=False)
+        yield replace(self, depth=depth, is_collapsed=False)
         for child in self.children:
-            yield from child.unfolded(depth + 1)
+            yield from child.expanded(depth + 1)
 
 
 def collapse(client: TrackingStore, runs: Sequence[Run]) -> list[RunRow]:
-    """Return a row for each run whose parent is not among the runs; the others are folded into these rows.
+    """Return a row for each run whose parent is not among the runs; the others are collapsed into these rows.
 
     Runs that are nested too deeply, or are their own ancestors, also have rows of their own.
     """

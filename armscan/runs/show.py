@@ -24,6 +24,7 @@ from armscan.tracking.tags import (
     DESCRIPTION_TAG,
     EVALUATED_TAG,
     FAILURE_TAG,
+    OVERRIDES_TAG,
     PARENT_TAG,
     STUDY_TAG,
     TRIAL_TAG,
@@ -34,7 +35,7 @@ from armscan.utils.files import sha256
 from armscan.utils.run_files import BEST_CHECKPOINT, ID_CHARS, LAST_CHECKPOINT
 
 # Tags that say how a run was started; the first one that it has is shown.
-STARTED_BY = ("command", "overrides")
+STARTED_BY = ("command", OVERRIDES_TAG)
 MAX_VALUE_CHARS = 200
 
 

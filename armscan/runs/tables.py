@@ -25,7 +25,7 @@ from armscan.utils.run_files import ID_CHARS
 from armscan.utils.text import PERCENT, formatted
 
 MISSING = "-"
-# Longest name to show; that of a multirun is its command line.
+# Longest name to show; that of a grid is its command line.
 MAX_NAME_CHARS = 80
 
 
@@ -68,7 +68,7 @@ def _print_table(rows: Sequence[RunRow]) -> None:
     cells = []
     for row in rows:
         on_plane, success, steps = row.on_plane_rate, row.success_rate, row.mean_steps
-        size = decimal(row.n_bytes) + ("" if row.in_store is not None else "+?")
+        size = decimal(row.n_bytes) + ("" if row.artifact_bytes is not None else "+?")
         best = "best " if BEST_TAG in row.run.data.tags else ""
         within = "" if len(limits) == 1 else " ({:g} mm {:g}°)".format(*row.on_plane)
         cells.append(
@@ -122,7 +122,7 @@ def _values(row: RunRow) -> dict[str, Any]:
         *(info.run_id, info.run_name, info.status, info.experiment_id, tags.get(PARENT_TAG)),
         *(row.started.isoformat(timespec="seconds"), row.duration_s),
         *(row.on_plane_rate, *row.on_plane, row.success_rate, row.mean_steps),
-        *(row.n_bytes, row.in_folder, row.in_store, len(row.below)),
+        *(row.n_bytes, row.folder_bytes, row.artifact_bytes, len(row.below)),
         *(tags.get(AGENT_TAG), tags.get(OBS_TAG), projection_of(row.run)),
         *(tags.get(FOLDER_TAG), tags.get(HOST_TAG), tags.get(BEST_TAG)),
     )

@@ -27,7 +27,7 @@ LEVEL = 0.95
 # Quantiles at the ends of an interval.
 LOWER, UPPER = (1 - LEVEL) / 2, (1 + LEVEL) / 2
 N_RESAMPLES = 2000
-# Most resampled values in memory at once.
+# Maximum number of resampled values in memory at once.
 MAX_VALUES = 2_000_000
 
 Statistic = Callable[[FloatArray], FloatArray]

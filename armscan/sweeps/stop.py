@@ -1,4 +1,7 @@
-"""`armscan runs stop`: ask the workers of a study to end a trial, or the study; they see it at their next report."""
+"""`armscan runs stop`: ask the workers of a study to end a trial, or the study.
+
+They do so at their first report after a heartbeat.
+"""
 
 from __future__ import annotations
 
@@ -64,7 +67,7 @@ def stop_study(uri: str, name: str) -> str:
     if not n_running:
         return f"study {name}: no trial is running; the command that started it resumes it, unless it has ended"
     return (
-        f"study {name}: {counted(n_running, 'running trial')} will be requeued at the next report; "
+        f"study {name}: {counted(n_running, 'running trial')} will be requeued within ten seconds and an epoch; "
         "the command that started it resumes it"
     )
 
@@ -94,7 +97,7 @@ def stop_trial(uri: str, name: str, number: int) -> str:
     except UpdateFinishedTrialError as error:
         ended = trials[number].state.name.lower()
         raise StudyError(f"trial {number} of study {name} has ended already ({ended})") from error
-    return f"trial {number} of study {name} will end at its next report, as pruned; it counts as finished"
+    return f"trial {number} of study {name} will end within ten seconds and an epoch, as pruned; it counts as finished"
 
 
 def stop_running_trial(storage: Storage, trial_id: int) -> bool:

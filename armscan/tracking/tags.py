@@ -5,6 +5,8 @@ PARENT_TAG, DESCRIPTION_TAG = "mlflow.parentRunId", "mlflow.note.content"
 COMMIT_TAG = "mlflow.source.git.commit"
 # Absolute path of a run's folder, and the name of its machine.
 FOLDER_TAG, HOST_TAG = "folder", "host"
+# Overrides of a run, as on its command line; of a study those of the latest command.
+OVERRIDES_TAG = "overrides"
 # Version of armscan that made a run.
 VERSION_TAG = "armscan.version"
 # Prefix of the tags with a run's choice of each configuration group. Only trainings have them, not their parent runs.

@@ -82,7 +82,7 @@ class TrainingDomain:
             here, there = self.observed.get(name), other.observed.get(name)
             if here != there:
                 raise InvalidValueError(
-                    f"the agent was trained on observations whose part {name!r} has the shape {here}, but on these "
+                    f"the agent takes observations whose part {name!r} has the shape {here}, but on these "
                     f"volumes it has {there}: it cannot be applied to them; obs.shape=[ACROSS,DEPTH] at training gives "
                     "images of one shape, and obs=cluster none"
                 )

@@ -22,7 +22,7 @@ from armscan.stats.on_plane import ON_PLANE, OnPlane
 from armscan.training.episode_results import Env, EpisodeResult, Evaluation
 from armscan.utils.validation import check_int
 
-# Most episodes side by side; more would hardly be faster, and each keeps its observations in memory.
+# Maximum number of episodes side by side; more would hardly be faster, and each keeps its observations in memory.
 MAX_SIDE_BY_SIDE = 64
 
 

@@ -1,8 +1,8 @@
 """A result in a few sentences: its on-plane rate, whether it beats random planes, and its distance from the plane.
 
 The difference from the random agent is paired: the rates on each volume are compared, so that a volume that is easy
-for both does not hide what the agent adds. Its interval is for other wrists and, with several trainings, other seeds.
-If the difference is the same on all wrists, the interval is Newcombe's, which takes episodes as independent.
+for both does not hide what the agent adds. Its interval is for other subjects and, with several trainings, other seeds.
+If the difference is the same for all subjects, the interval is Newcombe's, which takes episodes as independent.
 """
 
 from __future__ import annotations

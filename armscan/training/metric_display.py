@@ -80,7 +80,7 @@ def title_of(metric: str) -> str:
 
 
 def is_rate(metric: str) -> bool:
-    """Return whether a metric is a share of episodes."""
+    """Return whether a metric is a rate that is shown in percent."""
     return metric.endswith(("success_rate", "nerve_shown_rate")) or bool(limits_among([metric.rpartition("/")[2]]))
 
 

@@ -27,9 +27,9 @@ PADDING_CHARS = 2
 MISSING = "–"
 HOW = (
     "95 % intervals resample seeds, subjects and episodes. If all episodes of a rate are equal, its interval is "
-    "Wilson's, which takes episodes as independent. Means include failed episodes; the IQM is the mean of their middle "
-    "half. On plane: share of episodes whose last plane is this close to the labelled one. Success: share of episodes "
-    "whose last plane the reward accepts; it may lie far from the labelled one."
+    "Wilson's, which takes episodes as independent. Means include failed episodes; the IQM is the mean of the middle "
+    "half of all episodes. On plane: share of episodes whose last plane is this close to the labelled one. Success: "
+    "share of episodes whose last plane the reward accepts; it may lie far from the labelled one."
 )
 HOW_WITHOUT_EPISODES = "95 % intervals are Student's, for other seeds and subjects; none if all values are equal."
 COUNTS = {"episodes": "n_episodes", "started solved": "n_started_solved", "seeds": "n_seeds", "volumes": "n_volumes"}

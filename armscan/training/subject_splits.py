@@ -57,8 +57,8 @@ def test_and_next_fold(subjects: Sequence[str], folds: object, fold: object, see
     count = n_folds(folds, len(subjects))
     if fold is None:
         raise InvalidValueError(
-            f"data.folds is {folds!r}, but data.fold is None: give one fold, data.fold=0 to {count - 1}; armscan run "
-            "makes a run of each, but not a study, where data.folds is on its command line or in its experiment"
+            f"data.folds is {folds!r}, but data.fold is None: give one fold, data.fold=0 to {count - 1}. armscan run "
+            "runs every fold if its command line or experiment sets data.folds; a study does not"
         )
     number = check_int("data.fold", fold, at_least=0, at_most=count - 1)
     order = np.random.default_rng(check_seed("data.split_seed", seed)).permutation(len(subjects))

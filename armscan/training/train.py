@@ -94,7 +94,7 @@ class TrainingResult:
     Args:
         reports: Report of each epoch, in order.
         is_solved: Whether it stopped early because the task was solved.
-        wall_s: Seconds of learning and validating, before and after an interruption.
+        wall_s: Seconds of the training, checkpoints and callbacks included, before and after an interruption.
     """
 
     reports: tuple[EpochReport, ...]

@@ -1,4 +1,4 @@
-"""Optuna's dashboard without the attributes that workers keep for each other."""
+"""Changes to Optuna's dashboard: attributes, progress, links, and the button that fails a trial."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class DashboardView:
         stop: Function that asks the worker of a trial, by its ID in the storage, to end it; returns whether there is a
             worker. The button that fails a running trial calls it: the worker keeps its results, and the trial ends as
             pruned.
-        mlflow: Address of MLflow's UI for the links of trials; None: the links stay as they are.
+        mlflow: Address of MLflow's UI for the links in notes; None: the links stay as they are.
     """
 
     def __init__(self, application: WSGIApplication, stop: Callable[[int], bool], mlflow: str | None) -> None:

@@ -24,7 +24,7 @@ class HostCheck:
 
     Args:
         application: WSGI application to protect.
-        hosts: Allowed values of the header Host, `NAME:PORT`; `*` stands for any port.
+        hosts: Patterns of allowed Host headers, `NAME:PORT`; `*` matches any text.
     """
 
     def __init__(self, application: WSGIApplication, hosts: Sequence[str]) -> None:
@@ -35,7 +35,7 @@ class HostCheck:
         if self._is_allowed(environ):
             is_artifact = environ.get("PATH_INFO", "").startswith(ARTIFACTS)
             return self._application(environ, _sandboxed(start_response) if is_artifact else start_response)
-        body = f"403: this server answers only {', '.join(self._hosts)}, and only pages of its own\n".encode()
+        body = f"403: this server is reached only as {', '.join(self._hosts)}, and only from its own pages\n".encode()
         start_response("403 Forbidden", [("Content-Type", "text/plain"), ("Content-Length", str(len(body)))])
         return [body]
 

@@ -69,9 +69,9 @@ def start_dashboard(
         artifacts: Folder of the plots that it shows.
         port: Port to listen on.
         host: Address to listen on. Default: the loopback address.
-        allowed_hosts: Names and ports, `NAME:PORT`, by which browsers may reach it; `*` stands for any port.
+        allowed_hosts: Names and ports, `NAME:PORT`, by which browsers may reach it; `*` matches any text.
             Default: `127.0.0.1` and `localhost` with the port.
-        mlflow: Address of MLflow's UI for the links of trials. Default: None, the links stay as they are.
+        mlflow: Address of MLflow's UI for the links in notes. Default: None, the links stay as they are.
     """
     from optuna.artifacts import FileSystemArtifactStore
     from optuna_dashboard import wsgi

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from armscan.sweeps.storage.storage import Storage
 
 # One of the tables of MLflow.
-RUNS_TABLE = "experiments"
+MLFLOW_TABLE = "experiments"
 
 
 def show(
@@ -67,7 +67,7 @@ def show(
         runs_at = f"http://{HOST}:{mlflow_port}" if has_runs else None
         dashboard = start_dashboard(studies, artifacts, dashboard_port, mlflow=runs_at)
         print(f"studies   {dashboard}", flush=True)
-        if (judged := last_judged(studies)) is not None:
+        if (judged := newest_judged(studies)) is not None:
             name, number = judged
             print(f"result    {dashboard}/dashboard/studies/{number}/note (study {printable(name)})", flush=True)
     if has_runs:
@@ -83,8 +83,8 @@ def show(
         threading.Event().wait()
 
 
-def last_judged(storage: Storage) -> tuple[str, int] | None:
-    """Return the name and the number of the last study with a result; None if there is none."""
+def newest_judged(storage: Storage) -> tuple[str, int] | None:
+    """Return the name and the ID of the newest study with a result; None if there is none."""
     # Deferred, as above.
     from optuna.trial import TrialState
 
@@ -112,7 +112,7 @@ def _has_runs(uri: str) -> bool:
     if uri.startswith(SQLITE_PREFIX) and not sqlite_file(uri).is_file():
         return False
     try:
-        return RUNS_TABLE in tables_in(database_url(uri, TRACKING_PASSWORD))
+        return MLFLOW_TABLE in tables_in(database_url(uri, TRACKING_PASSWORD))
     except (SQLAlchemyError, ImportError, OSError, ValueError) as error:
         # The reason, without the statement that failed.
         reason = reason_of(getattr(error, "orig", None) or error)

@@ -1,1 +1,1 @@
-"""Validation, files, retries, logging, threads."""
+"""Validation, files, retries, logging, processes, text."""

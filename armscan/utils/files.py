@@ -125,7 +125,7 @@ def _unfinished(path: Path) -> Path:
 
 
 def sha256(contents: bytes) -> str:
-    """Return the SHA-256 of a file's contents."""
+    """Return the SHA-256 of bytes, as 64 hexadecimal digits."""
     return hashlib.sha256(contents).hexdigest()
 
 

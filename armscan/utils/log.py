@@ -11,7 +11,7 @@ from armscan.errors import printable
 
 
 def log(text: str) -> None:
-    """Print a line with the time, for the log of a worker."""
+    """Print a line that begins with the local time."""
     print(f"{datetime.now():%Y-%m-%d %H:%M:%S}  {printable(text)}", flush=True)
 
 

@@ -89,7 +89,7 @@ def process_start(pid: int) -> str:
     """Return the start time of a process, which tells it from a later one with the same ID, however the clock is set.
 
     Returns:
-        The time in seconds, as a string; an empty one if there is no such process, or only a zombie.
+        Seconds since boot (Linux) or since 1970, as a string; empty if there is no such process, or only a zombie.
     """
     try:
         process = psutil.Process(pid)

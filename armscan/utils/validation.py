@@ -39,7 +39,7 @@ def check_float(
     at_least: float = -math.inf,
     at_most: float = math.inf,
 ) -> float:
-    """Return `value` as a float if it is finite and inside the given bounds."""
+    """Return `value` as a float if it is finite, > `above`, >= `at_least` and <= `at_most`."""
     bounds = [
         f"{word} {bound:g}"
         for word, bound in (("above", above), ("at least", at_least), ("at most", at_most))
@@ -104,7 +104,7 @@ def check_path(name: str, value: Any) -> Path:
 
 
 def is_finite(value: Any) -> bool:
-    """Return whether `value` is a number, not a truth value, that a float can hold."""
+    """Return whether `value` is a finite number that fits a float, not a truth value."""
     try:
         return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
     except OverflowError:

@@ -15,7 +15,7 @@ def environment(tmp_path, monkeypatch):
     folder.mkdir(parents=True)
     for name in ("python", "armscan"):
         (folder / name).touch(mode=0o755)
-    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(command_hints, "STARTED_IN", tmp_path)
     monkeypatch.setattr(sys, "executable", str(folder / "python"))
     monkeypatch.setenv("PATH", "")
     monkeypatch.delenv(UV_RUN, raising=False)
@@ -31,7 +31,7 @@ def test_path_is_typed_where_nothing_is_activated(environment):
 
 def test_path_is_absolute_elsewhere(environment, tmp_path, monkeypatch):
     (tmp_path / "elsewhere").mkdir()
-    monkeypatch.chdir(tmp_path / "elsewhere")
+    monkeypatch.setattr(command_hints, "STARTED_IN", tmp_path / "elsewhere")
     assert armscan_command("ui").startswith(f"{environment}/armscan ui")
 
 

@@ -6,7 +6,7 @@ from hydra.utils import instantiate
 
 from armscan.config.compose import compose
 from armscan.config.sources import config_folder
-from armscan.experiment.build import build_experiment
+from armscan.experiment.build import build_setup
 from tests.conftest import DATA
 from tests.support import FEW_VOLUMES
 
@@ -47,7 +47,7 @@ def test_conf_composes_every_agent_and_experiment(override):
     # Few phantoms are quick, even if an experiment asks for more. The threshold is loose, because a reward that is
     # fitted to one wrist alone would not accept the labelled plane of another.
     few = [*FEW_VOLUMES, "env.success_threshold=0.5"]
-    experiment = build_experiment(compose([override, *BESIDE.get(override, []), *few]))
+    experiment = build_setup(compose([override, *BESIDE.get(override, []), *few]))
     env = experiment.env_factory.make_env(experiment.split.test)
     observation, info = env.reset(seed=0)
     experiment.agent.begin(seed=0, bounds=env.get_wrapper_attr("scene").bounds)

@@ -58,5 +58,5 @@ def test_plane_is_found_in_a_volume_whose_middle_shows_nothing(database, tmp_pat
         return LabelVolume(labels, volume.spacing, "part")
 
     search(only(0.65, 0.72))
-    with pytest.raises(OptimalPlaneError, match=r"^part: the agent's environment sees nothing at 7 places of the arm"):
+    with pytest.raises(OptimalPlaneError, match=r"^part: the agent's environment sees nothing at 7 values of ty"):
         search(only(0.62, 0.68))

@@ -8,7 +8,7 @@ import pytest
 from armscan.config.compose import compose
 from armscan.envs import SliceObservation
 from armscan.errors import InvalidValueError
-from armscan.experiment.build import build_experiment, check_effects, set_up
+from armscan.experiment.build import build_setup, check_effects, set_up
 from armscan.training import Split
 
 
@@ -45,7 +45,7 @@ def config_of_sizes(phantom, monkeypatch, *overrides):
     ids=str,
 )
 def test_build_crops_images_of_all_splits_alike(phantom, overrides, monkeypatch):
-    experiment = build_experiment(config_of_sizes(phantom, monkeypatch, *overrides))
+    experiment = build_setup(config_of_sizes(phantom, monkeypatch, *overrides))
     volumes = (experiment.split.training, experiment.split.validation, experiment.split.test)
     frames = [experiment.env_factory.make_env(each).unwrapped.rules._observation for each in volumes]
     assert {frame.observations[0]._crop for frame in frames} == {(336, 80)}
@@ -63,7 +63,7 @@ def test_stage_refuses_volumes_that_an_observation_is_of_another_shape_on(phanto
 def test_agent_of_vectors_computes_on_the_cpu_beside_a_gpu(phantom, monkeypatch):
     config = config_of_sizes(phantom, monkeypatch)
     monkeypatch.setattr("armscan.agents.compute._has_cuda", lambda: True)
-    assert build_experiment(config).agent.update_note == "compiled"
+    assert build_setup(config).agent.update_note == "compiled"
 
 
 class Unfinished:
@@ -86,7 +86,7 @@ def test_build_refuses_an_agent_that_learns_but_lacks_what_training_needs(phanto
     config = config_of_sizes(phantom, monkeypatch)
     config.agent = {"_target_": "tests.experiment.test_build.Unfinished"}
     with pytest.raises(InvalidValueError, match=r"agent is Unfinished, which learns, .* has no .*policy.* or weights"):
-        build_experiment(config)
+        build_setup(config)
 
 
 @pytest.mark.parametrize("section", ["data", "training", "compute"])
@@ -94,7 +94,7 @@ def test_section_that_builds_something_else_is_refused(phantom, monkeypatch, sec
     config = config_of_sizes(phantom, monkeypatch)
     config[section] = {}
     with pytest.raises(InvalidValueError, match=f"^{section} builds {{}}, but it must build a "):
-        build_experiment(config)
+        build_setup(config)
 
 
 @pytest.mark.parametrize("override", ["network=mlp", "network.vector.hidden_sizes=[8]"])

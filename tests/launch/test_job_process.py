@@ -1,4 +1,4 @@
-"""Jobs of a multirun, each in its own process."""
+"""Jobs of a grid, each in its own process."""
 
 import io
 import json

@@ -14,7 +14,7 @@ from armscan import run
 from armscan.config.error_messages import one_line_message
 from armscan.errors import ArmscanError
 from armscan.experiment.job import INTERRUPTED, OUTCOME_FOLDER, PARENT_FILE, JobOutcome
-from armscan.launch.multirun import Multirun, _common, end_multirun
+from armscan.launch.multirun import Multirun, _common, end_grid
 from armscan.tracking import begin_outbox, sync
 from armscan.tracking.tags import FOLDER_TAG, JOB_TAG, PARENT_TAG
 from armscan.utils.processes import ProcessInfo
@@ -31,7 +31,7 @@ def test_second_interrupt_leaves_the_command_that_resumes_the_grid(tmp_path, mon
     parent = {"run_id": "a" * 32, "tracking": {"uri": "sqlite:///mine.db"}, "trust": False}
     (tmp_path / PARENT_FILE).write_text(json.dumps(parent))
     monkeypatch.setattr(Multirun, "folder", tmp_path)
-    monkeypatch.setattr(run, "end_multirun", Mock(side_effect=KeyboardInterrupt))
+    monkeypatch.setattr(run, "end_grid", Mock(side_effect=KeyboardInterrupt))
     run._end_interrupted()
     told = capsys.readouterr().err
     assert told.startswith("the grid was not closed; resume it with: ")
@@ -46,7 +46,7 @@ def test_error_while_an_interrupted_grid_is_closed_is_shown(monkeypatch):
         raise LookupError("of the end")
 
     monkeypatch.setattr(run, "launch", interrupt)
-    monkeypatch.setattr(run, "end_multirun", fail)
+    monkeypatch.setattr(run, "end_grid", fail)
     monkeypatch.setattr("sys.argv", ["armscan.run", "seed=1"])
     # The command sets it, and would take it for the user's setting the next time.
     monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
@@ -69,7 +69,7 @@ def test_job_that_was_stopped_alone_has_not_failed(tmp_path, database, monkeypat
         jobs.append(store.create_run(experiment_id, name="job", tags=tags).info.run_id)
     store.set_terminated(jobs[1], "FINISHED")
     monkeypatch.setattr(Multirun, "folder", tmp_path)
-    assert end_multirun() == 1
+    assert end_grid() == 1
     assert [store.get_run(run_id).info.status for run_id in (*jobs, parent)] == ["KILLED", "FINISHED", "KILLED"]
     assert "failed" not in capsys.readouterr().err
 

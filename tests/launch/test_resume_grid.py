@@ -7,7 +7,7 @@ import pytest
 from armscan.config.compose import compose
 from armscan.config.defaults import to_plain
 from armscan.errors import ChangedVolumesError, UntrustedError
-from armscan.experiment.build import build_experiment
+from armscan.experiment.build import build_setup
 from armscan.experiment.job import Invocation, Job
 from armscan.launch.resume_grid import earlier_runs, run_again
 from armscan.tracking import TrackedRun
@@ -53,7 +53,7 @@ def test_grid_goes_on_with_the_same_volumes_alone(tmp_path, database, change):
     config = compose([*words, "seed=1"])
     client, experiment_id = store_in(tmp_path, config.tracking.experiment)
     # Another job of the grid, on the same volumes.
-    prints = build_experiment(config).split.fingerprints()
+    prints = build_setup(config).split.fingerprints()
     (name,) = prints["test"]
     if change == "new":
         prints["test"] = {}

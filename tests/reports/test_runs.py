@@ -21,7 +21,7 @@ def page(folder):
 @pytest.fixture
 def parent(runs):
     """Yield a parent of all runs, as in a multirun."""
-    parent = runs.made("multirun agent=sac,ppo seed=0,1,2")
+    parent = runs.made("grid agent=sac,ppo seed=0,1,2")
     for each in runs.all:
         runs.client.set_tag(each.info.run_id, "mlflow.parentRunId", parent)
     yield parent

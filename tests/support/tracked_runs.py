@@ -9,7 +9,7 @@ from mlflow import MlflowClient
 from omegaconf import OmegaConf
 
 from armscan.config.compose import compose
-from armscan.experiment.build import build_experiment
+from armscan.experiment.build import build_setup
 from armscan.experiment.provenance import volume_tags
 from armscan.tracking import TrackedRun
 from armscan.tracking.tags import DOMAIN_TAG, VOLUMES
@@ -56,7 +56,7 @@ def tracked(folder, *overrides, agent=None, kept=("config.yaml", "volumes.json",
     if agent:
         config.agent = agent
     with contextlib.chdir(folder):
-        experiment = build_experiment(config)
+        experiment = build_setup(config)
     client, experiment_id = store_in(folder, "armscan")
     domain = TrainingDomain.of(experiment.env_factory.make_env(experiment.split.training))
     (folder / "config.yaml").write_text(yaml.safe_dump(OmegaConf.to_container(config)))

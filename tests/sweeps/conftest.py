@@ -52,9 +52,10 @@ def opened(tmp_path, empty_database, monkeypatch):
     shutil.copy(empty_database, tmp_path / "runs.db")
     tracking = {"uri": "sqlite:///runs.db", "experiment": "a", "artifacts": "artifacts", "wait_s": 60.0}
 
-    def open_study(storage="optuna.journal", name="a", **changes):
+    def open_study(storage="optuna.journal", name="a", overrides=("sweep=sac_y",), volumes=None, **changes):
         asked = settings(name=name, storage=storage, folder=f"studies/{name}", **changes)
-        return open_for_work(asked, TASK, OmegaConf.create({"tracking": tracking}), ["sweep=sac_y"])
+        config = OmegaConf.create({"tracking": tracking})
+        return open_for_work(asked, TASK, config, overrides, volumes=volumes)
 
     open_study.store = open_store(**tracking)
     return open_study

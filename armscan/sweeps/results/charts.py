@@ -80,7 +80,7 @@ def charts_of(
 
 def _on_importance(n_trials: int) -> str:
     said = (
-        "How much each key sets the best tenth of the trials apart from the others (PED-ANOVA), relative to the other "
+        "How much each key sets the best tenth of the trials apart from all trials (PED-ANOVA), as a share of all "
         "keys. A key that only tells bad trials from worse ones gets little."
     )
     return said + (f" {counted(n_trials, 'trial')} say little: some fifty are required." if n_trials < ENOUGH else "")

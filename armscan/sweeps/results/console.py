@@ -24,7 +24,7 @@ from armscan.sweeps.storage.attributes import check_trials
 from armscan.sweeps.study.candidates import NOTHING_SEARCHED
 from armscan.sweeps.study.final_eval import FinalEvaluation
 from armscan.sweeps.study.phase import OpenedStudy
-from armscan.sweeps.study.study import best_trials
+from armscan.sweeps.study.study import best_trials, change_notes
 from armscan.sweeps.tasks.attempt import trial_folder
 from armscan.training.metric_display import title_of, value_text
 from armscan.utils.console import WHOLE_CHARS, print_sentence, wide_console
@@ -76,6 +76,9 @@ def _print_best(opened: OpenedStudy) -> None:
     wide_console(WHOLE_CHARS).print(table)
     for trial in best:
         print_sentence(f"trial {trial.number}: {' '.join(rounded_overrides(searched_values(trial)))}")
+    # A judgement has these notes too.
+    for note in () if opened.final_eval is not None else change_notes(opened.search.scheduler.study):
+        print_sentence(printable(f"note: {note}"))
 
 
 def _print_replay(opened: OpenedStudy) -> None:
@@ -111,7 +114,7 @@ def _print_final_results(opened: OpenedStudy, final: FinalEvaluation) -> int:
     if judgement is None or judgement.of_chosen is None:
         nothing = "final training has finished" if candidates else "trial is complete and keeps all constraints"
         code, reason = 1, f"no {nothing}"
-        if not final.is_over:
+        if not final.has_begun_all:
             code, reason = unfinished, "trainings are missing; the same command resumes the study"
         print(f"error: no final evaluation, because {reason}", file=sys.stderr)
         return code

@@ -145,11 +145,10 @@ def _importance_rows(study: optuna.Study, objectives: Sequence[str]) -> list[Row
     rows: list[Row] = []
     if len(study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))) < MIN_TRIALS_FOR_IMPORTANCE:
         return rows
-    # The evaluator assumes that lower is better.
+    # With a target, the evaluator assumes that lower is better, and warns.
     for number, (objective, sign) in enumerate(zip(objectives, loss_signs(study.directions).tolist(), strict=True)):
         target = _value(number, sign) if len(objectives) > 1 else None
         with warnings.catch_warnings():
-            # It warns that it assumes so.
             warnings.simplefilter("ignore")
             shares = get_param_importances(study, evaluator=PedAnovaImportanceEvaluator(), target=target)
         rows += [{"objective": objective, "key": key, "importance": share} for key, share in shares.items()]

@@ -28,7 +28,7 @@ from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.attribute_names import METRICS, OBJECTIVES
 from armscan.sweeps.study.candidates import NOTHING_SEARCHED, name_of, settings_of, training_of
 from armscan.sweeps.study.final_eval import FinalEvaluation, to_judge
-from armscan.sweeps.study.study import best_trials
+from armscan.sweeps.study.study import best_trials, change_notes
 from armscan.training.baselines import RANDOM
 from armscan.training.episode_results import TEST_METRICS
 from armscan.training.headline import headline
@@ -41,7 +41,7 @@ MAXIMIZE = "maximize"
 COMPARISONS = ("difference", "probability_of_improvement")
 HOW = (
     "A difference is the mean of the paired differences over all seeds and test volumes; its interval is for other "
-    "seeds and wrists. The probability of improvement is the probability that a training of the chosen configuration "
+    "seeds and subjects. The probability of improvement is the probability that a training of the chosen configuration "
     "is better on a volume than one of the control. Rates differ by percentage points."
 )
 
@@ -115,6 +115,7 @@ class Judgement:
         have_others_failed: Whether a training of every other candidate failed in the race. Default: False.
         violated: Constraints of the study that configurations violated in the race. Default: none.
         is_repeated: Whether trainings with an earlier configuration of the study were judged before. Default: False.
+        changes: Notes on changes of the study's configuration. Default: none.
     """
 
     chosen: int
@@ -128,11 +129,12 @@ class Judgement:
     have_others_failed: bool = False
     violated: Mapping[int, Sequence[str]] = field(default_factory=dict)
     is_repeated: bool = False
+    changes: Sequence[str] = ()
 
     @property
     def notes(self) -> list[str]:
         """Notes on the judgement."""
-        notes = []
+        notes = [*self.changes]
         if self.n_seeds < self.n_planned:
             notes.append(f"only {self.n_seeds} of {self.n_planned} seeds have been trained to their end")
         for number, violated in self.violated.items():
@@ -169,7 +171,8 @@ class Judgement:
         if self.chosen == CONTROL and self.have_others_failed:
             return "The default configuration was chosen, because trainings of all other candidates have failed."
         if self.chosen == CONTROL:
-            return "No setting beat the default configuration in the selection, on the validation volumes."
+            of_them = " that keeps all constraints" if self.violated and CONTROL not in self.violated else ""
+            return f"No setting{of_them} beat the default configuration in the selection, on the validation volumes."
         name = name_of(self.chosen).capitalize()
         if not self.differences and self.n_unjudged:
             return f"{name} was chosen; it has not been judged beside the control yet."
@@ -221,6 +224,7 @@ def judge(final: FinalEvaluation) -> Judgement | None:
         n_unjudged=final.n_unjudged,
         violated={number: each for number, each in final.violated().items() if number in race.standings},
         is_repeated=not all(map(final.is_current, complete)),
+        changes=change_notes(final.search),
         have_others_failed=bool(of_others) and all(standing.has_failed for standing in of_others),
     )
 

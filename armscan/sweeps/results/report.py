@@ -23,7 +23,7 @@ from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.attribute_names import FINALIST, FOLDER, LEASE, OBJECTIVES, RUN, TAKEN_FROM, TERMINATED
 from armscan.sweeps.study.candidates import name_of, settings_of
 from armscan.sweeps.study.final_eval import FinalEvaluation
-from armscan.sweeps.study.study import best_trials
+from armscan.sweeps.study.study import best_trials, change_notes
 from armscan.training.metric_display import title_of, value_text
 from armscan.utils.run_files import ID_CHARS
 from armscan.utils.text import counted
@@ -74,7 +74,7 @@ def write_report(
         _videos(final_trials),
         "<h2>Trials</h2>",
         _trials(trials, objectives) if trials else "<p>No trial has been begun.</p>",
-        "<h2>How trials have ended</h2>",
+        "<h2>States of the trials</h2>",
         table([{**row, "ending": _said(row["ending"])} for row in tables["endings"]]),
         "<h2>Failures</h2>",
         _failures(trials),
@@ -100,6 +100,7 @@ def _summary(study: optuna.Study, state: StudyState, best: Sequence[FrozenTrial]
         values = zip(objectives, best[0].values, strict=True)
         said = "; ".join(f"{title_of(name)} {value_text(name, value)}" for name, value in values)
         text += f" Best in the search: trial {best[0].number}, {html.escape(said)} (optimistically biased)."
+    text += "".join(f" Note: {html.escape(note)}." for note in change_notes(study))
     return f"<p>{text}</p>"
 
 
@@ -133,7 +134,7 @@ def _trials(trials: Sequence[FrozenTrial], objectives: Sequence[str]) -> str:
         rows.append(
             {
                 "trial": trial.number,
-                "ended": _ended(trial),
+                "state": _state(trial),
                 **dict.fromkeys(map(title_of, objectives), ""),
                 **{title_of(name): value_text(name, value) for name, value in values},
                 **_settings(trial.params),
@@ -144,8 +145,8 @@ def _trials(trials: Sequence[FrozenTrial], objectives: Sequence[str]) -> str:
     return table(rows, what="trials")
 
 
-def _ended(trial: FrozenTrial) -> str:
-    """Return how a trial has ended, whether it violates a constraint, and which study it was taken from, if any."""
+def _state(trial: FrozenTrial) -> str:
+    """Return the state of a trial, whether it violates a constraint, and which study it was taken from, if any."""
     infeasible = "" if is_feasible(trial) else ", infeasible"
     elsewhere = f", in {trial.user_attrs[TAKEN_FROM]}" if TAKEN_FROM in trial.user_attrs else ""
     return f"{_said(trial.state.name.lower())}{infeasible}{elsewhere}"

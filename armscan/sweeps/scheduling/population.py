@@ -40,7 +40,7 @@ class PopulationSampler(RandomSampler):
         quantile: Fraction of the members, above 0 and at most 0.5, that counts as worst; each of these continues from
             one of equally many best members. Default: 0.25.
         resample_probability: Probability of resampling a value instead of changing it by a fifth. Default: 0.25.
-        seed: Seed of the draws. Default: None, other draws each time.
+        seed: Seed that Optuna gives a sampler, without effect: the draws have the study's. Default: None.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class Population:
         """Return the next trial; nothing while all members train, and at the end.
 
         The member that is furthest behind trains next. A member among the worst of its generation so far continues from
-        a checkpoint of one of the best, with changed values; so does one whose training has failed.
+        a checkpoint of one of the best, with changed values; so does one whose training has failed or was stopped.
 
         Args:
             trials: All trials of the study.

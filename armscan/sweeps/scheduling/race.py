@@ -64,9 +64,9 @@ class Race:
     """State of a race.
 
     Args:
-        n_trained: Number of trainings that have a score, without those of withdrawn configurations.
-        missing: Trainings of this round without a score, the running ones included, as pairs of a configuration and a
-            seed. Empty if the race is over.
+        n_trained: Number of trainings that have ended, failed ones included, without those of withdrawn configurations.
+        missing: Trainings of this round that have not ended, as pairs of a configuration and a seed. Empty if the race
+            is over.
         chosen: Configuration that was chosen; None while the race continues, or if all configurations have failed in
             the first round.
         standings: Standing of each configuration.

@@ -4,6 +4,8 @@
 SPACE, FIXED, OBJECTIVES = "space", "fixed_config", "objectives"
 # Every study of armscan has these.
 OF_STUDY = {SPACE, FIXED, OBJECTIVES}
+# The configurations of earlier trials, each by the number of the first trial after it.
+EARLIER_CONFIGS = "earlier_configs"
 # Its tracked run, the SHA-256 of armscan's own note in the dashboard, and the origins of its initial trials.
 STUDY_RUN, NOTE_SUM, BEGUN_WITH = "mlflow_run", "note_sha256", "begun_with"
 # Why it has ended, and the settings asked for at that time, or, once it is reopened, the number of trials finished by

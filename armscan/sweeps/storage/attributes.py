@@ -26,6 +26,7 @@ UNREADABLE = (*DAMAGED, LookupError)
 LARGEST = 2**63 - 1
 MAX_STEP_DIGITS = 18
 Number = Annotated[int, Field(ge=0, le=LARGEST, description="a whole number of at least 0")]
+TrialNumber = Annotated[str, Field(pattern=r"^[0-9]{1,10}$")]
 # Until the year 5138.
 Seconds = Annotated[float, Field(ge=0, le=1e11)]
 # Excludes keys that name a class, such as `agent._target_`.
@@ -53,6 +54,9 @@ class StudyAttributes(_Attributes):
     space: dict[str, str] = Field(description="strings by the names of keys")
     fixed_config: dict[str, Any] = Field(description="values by the names of keys")
     objectives: dict[str, str] = Field(description="directions by the names of metrics")
+    earlier_configs: dict[TrialNumber, dict[str, Any]] = Field(
+        default={}, description="configurations by trial numbers"
+    )
     mlflow_run: Text = ""
     note_sha256: Text = ""
     stop: Text = ""

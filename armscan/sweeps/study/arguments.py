@@ -13,7 +13,7 @@ from hydra.core.override_parser.types import Override
 from omegaconf import OmegaConf
 
 from armscan.config.command_hints import run_command
-from armscan.config.compose import compose, of_run
+from armscan.config.compose import compose, reduce_to_run
 from armscan.config.defaults import MULTIRUN, NOT_SEARCHED, PLAN, RESUME
 from armscan.config.sources import SWEEP
 from armscan.errors import InvalidValueError
@@ -83,7 +83,7 @@ def check_training_overrides(arguments: Sequence[str]) -> None:
     overrides = trial_overrides(StudyCommand.read(arguments).overrides)
     config = compose(overrides, return_hydra_config=True)
     if OmegaConf.select(config, TASK_TARGET) == TRAINING_TASK:
-        of_trainings = of_run(config)[0]
+        of_trainings = reduce_to_run(config)[0]
         check_config(of_trainings)
         check_effects(of_trainings, overrides)
 

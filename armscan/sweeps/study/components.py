@@ -15,7 +15,7 @@ from omegaconf.errors import OmegaConfBaseException
 from optuna.pruners import BasePruner
 from optuna.samplers import BaseSampler
 
-from armscan.config.compose import compose, compose_run, of_run
+from armscan.config.compose import compose, compose_run, reduce_to_run
 from armscan.config.defaults import to_plain
 from armscan.config.error_messages import one_line_message
 from armscan.config.sources import SWEEP
@@ -67,7 +67,8 @@ def read_settings(overrides: Sequence[str]) -> tuple[StudySettings, Task, DictCo
         )
     make("pruner", settings.pruner, BasePruner)
     if settings.terminator is not None:
-        make_terminator(settings).check(len(settings.objectives), len(settings.seeds))
+        n_trials = None if settings.warm_start else settings.n_trials
+        make_terminator(settings).check(len(settings.objectives), len(settings.seeds), n_trials)
     for name, folder in (("folder", settings.folder), ("artifacts", settings.artifacts)):
         if not (there := nearest_existing(Path(folder))).is_dir():
             raise StudyError(f"study.{name} is {folder!r}, but {str(there)!r} is not a folder")
@@ -79,7 +80,7 @@ def read_settings(overrides: Sequence[str]) -> tuple[StudySettings, Task, DictCo
             f"study.task is {settings.task['_target_']}, whose final_metric is {task.final_metric!r}, but it must "
             f"begin with {TEST_PREFIX}, as all metrics that its evaluate returns"
         )
-    of_trials, _ = of_run(config)
+    of_trials, _ = reduce_to_run(config)
     returned = task.metrics(of_trials)
     for name in settings.objectives:
         if name not in returned:

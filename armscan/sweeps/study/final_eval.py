@@ -149,7 +149,7 @@ class FinalEvaluation:
         return self._planned(self.race().missing, self.selection)
 
     @property
-    def is_over(self) -> bool:
+    def has_begun_all(self) -> bool:
         """Whether the selection has ended, with or without a choice, and all trainings of the judgement have begun."""
         return self.race().is_over and not self.missing_of_judgement()
 

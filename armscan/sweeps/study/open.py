@@ -31,7 +31,7 @@ from armscan.sweeps.study.study import fixed_config, make_study, name_objectives
 from armscan.sweeps.study.warm_start import values_of
 from armscan.sweeps.tasks.attempt import Task
 from armscan.tracking import TrackingStore, code_state, open_store, run_of_study
-from armscan.tracking.tags import STORAGE_TAG, STUDY_TAG, TRIAL_TAG
+from armscan.tracking.tags import OVERRIDES_TAG, STORAGE_TAG, STUDY_TAG, TRIAL_TAG
 from armscan.utils.files import atomic_write
 from armscan.utils.retry import RETRY_S
 
@@ -87,7 +87,10 @@ def open_for_work(
         artifacts=Path(settings.artifacts),
         client=client,
         experiment_id=experiment_id,
-        run_id=_tracked_run(study, storage, client, experiment_id, Path(settings.folder), overrides),
+        # Workers do not know the volumes.
+        run_id=_tracked_run(
+            study, storage, client, experiment_id, Path(settings.folder), overrides, is_command=volumes is not None
+        ),
         population=population,
     )
     final_eval = None
@@ -118,13 +121,18 @@ def _tracked_run(
     experiment_id: str,
     folder: Path,
     overrides: Sequence[str],
+    *,
+    is_command: bool,
 ) -> str:
-    """Return the ID of a study's own run in MLflow; create the run if the study has none yet."""
-    name = study.study_name
+    """Return the ID of a study's own run in MLflow, which shows the overrides of the latest command.
+
+    Create the run if the study has none yet.
+    """
+    name, words = study.study_name, " ".join(overrides)
 
     @functools.cache
     def create_run() -> str:
-        tags = {**code_state().tags, STUDY_TAG: name, STORAGE_TAG: storage.uri, "overrides": " ".join(overrides)}
+        tags = {**code_state().tags, STUDY_TAG: name, STORAGE_TAG: storage.uri, OVERRIDES_TAG: words}
         return str(client.create_run(experiment_id, name=f"study {name}", tags=tags).info.run_id)
 
     def tracked_run() -> str:
@@ -139,6 +147,8 @@ def _tracked_run(
             tags={STUDY_TAG: name, TRIAL_TAG: None},
             where=f"{name}.user_attrs.{STUDY_RUN}",
         )
+        if is_command and run.data.tags.get(OVERRIDES_TAG) != words:
+            client.set_tag(run.info.run_id, OVERRIDES_TAG, words)
         return str(run.info.run_id)
 
     return storage.exclusive(tracked_run)

@@ -58,6 +58,9 @@ def print_plan(
     limits = [counted(settings.n_trials, "trial")]
     limits += [f"{settings.timeout_hours:g} hours"] if settings.timeout_hours is not None else []
     limits += [f"{settings.max_env_steps:,} environment steps"] if settings.max_env_steps is not None else []
+    limits += (
+        [f"or fewer by {settings.terminator['_target_'].rpartition('.')[2]}"] if settings.terminator is not None else []
+    )
     console.print(f"objective  {objectives}, over {_seeds(settings.seeds)}")
     console.print(f"limits     {', '.join(limits)}; {counted(settings.workers, 'worker')}")
     console.print(f"then       {_final(settings.final_eval)}")
@@ -95,8 +98,8 @@ def _print_cost(
         f"{state.env_steps:,} environment steps, {spent_mib:.0f} MiB"
     )
     console.print(
-        f"the rest   {counted(n_left, 'trial')} and the final evaluation, about {least:.2f} to {most:.2f} hours and "
-        f"{spent_mib / len(state.finished) * n_left:.0f} MiB ({mean_s:.0f} s a trial so far)"
+        f"the rest   {counted(n_left, 'trial')} and the final evaluation, about {least:.2f} to {most:.2f} hours; the "
+        f"trials alone {spent_mib / len(state.finished) * n_left:.0f} MiB ({mean_s:.0f} s a trial so far)"
         if most
         else "the rest   nothing: the study has finished"
     )

@@ -101,7 +101,8 @@ def crowding_distances(losses: Losses) -> Losses:
         losses: Losses, shape (trials, objectives).
 
     Returns:
-        Distances of shape (trials,); infinite for the best and the worst of an objective.
+        Distances of shape (trials,); infinite for the first best and the last worst of an objective
+        that varies.
     """
     distances = np.zeros(len(losses))
     for values in losses.T:

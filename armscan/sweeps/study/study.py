@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 import optuna
@@ -19,7 +20,15 @@ from armscan.errors import StudyError
 from armscan.sweeps.scheduling.population import searched_values
 from armscan.sweeps.scheduling.state import is_feasible
 from armscan.sweeps.space.parameter import hydra_literal
-from armscan.sweeps.storage.attribute_names import FIXED, GENERATION, MEMBER, OBJECTIVES, OF_STUDY, SPACE
+from armscan.sweeps.storage.attribute_names import (
+    EARLIER_CONFIGS,
+    FIXED,
+    GENERATION,
+    MEMBER,
+    OBJECTIVES,
+    OF_STUDY,
+    SPACE,
+)
 from armscan.sweeps.storage.attributes import StudyAttributes, check_trials
 from armscan.sweeps.storage.storage import Storage
 from armscan.sweeps.study.arguments import STUDY, fixed_by
@@ -63,11 +72,20 @@ def make_study(storage: Storage, settings: StudySettings, fixed: Mapping[str, An
 
     study = storage.exclusive(made)
     if _check_same(settings, study, wanted):
-        # The volumes are known to the command alone, not to its workers.
-        kept = {key: value for key, value in study.user_attrs[FIXED].items() if key.startswith(VOLUMES)}
-        study.set_user_attr(FIXED, kept | wanted[FIXED])
+        storage.exclusive(lambda: _reconfigure(study, wanted[FIXED]))
     name_objectives(study, list(settings.objectives))
     return study
+
+
+def _reconfigure(study: optuna.Study, wanted: Mapping[str, Any]) -> None:
+    """Store another configuration for the trials to come, and the one of the trials until now."""
+    there, n_trials = study.user_attrs, len(study.get_trials(deepcopy=False))
+    if n_trials:
+        # Two changes without a trial between them are one.
+        study.set_user_attr(EARLIER_CONFIGS, {str(n_trials): there[FIXED]} | there.get(EARLIER_CONFIGS, {}))
+    # The volumes are known to the command alone, not to its workers.
+    kept = {key: value for key, value in there[FIXED].items() if key.startswith(VOLUMES)}
+    study.set_user_attr(FIXED, {**kept, **wanted})
 
 
 def name_objectives(study: optuna.Study, names: Sequence[str]) -> None:
@@ -152,13 +170,36 @@ def comparable_settings(settings: StudySettings, fixed: Mapping[str, Any]) -> di
 
 def fixed_of(study: optuna.Study, wanted: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the fixed configuration of a stored study, and the wanted one, without what only one of them compares."""
-    there, wanted = migrate(study.user_attrs.get(FIXED, {})), dict(wanted[FIXED])
+    there = migrate(study.user_attrs.get(FIXED, {}))
     trials = study.get_trials(deepcopy=False)
     if POPULATION not in there and trials and not any(MEMBER in trial.user_attrs for trial in trials):
         there[POPULATION] = None
-    alone = {key for key in there.keys() ^ wanted.keys() if key.startswith(LATER)}
-    before, now = ({key: each[key] for key in each if key not in alone} for each in (there, wanted))
+    return _comparable(there, wanted[FIXED])
+
+
+def _comparable(before: Mapping[str, Any], now: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return two fixed configurations without what only one of them compares."""
+    alone = {key for key in before.keys() ^ now.keys() if key.startswith(LATER)}
+    before, now = ({key: each[key] for key in each if key not in alone} for each in (before, now))
     return before, now
+
+
+def config_changes(study: optuna.Study) -> dict[int, str]:
+    """Return how the configuration changed while a study ran, by the number of the first trial after each change."""
+    earlier = sorted((int(number), config) for number, config in study.user_attrs.get(EARLIER_CONFIGS, {}).items())
+    configs = [migrate(config) for config in (*(config for _, config in earlier), study.user_attrs.get(FIXED, {}))]
+    found = {
+        number: _differences(*_comparable(*pair)) for (number, _), pair in zip(earlier, pairwise(configs), strict=True)
+    }
+    return {number: differences for number, differences in found.items() if differences}
+
+
+def change_notes(study: optuna.Study) -> list[str]:
+    """Return a note on each change of a study's configuration."""
+    return [
+        f"trials before {number} had another configuration ({differences}), so their values do not compare with others"
+        for number, differences in config_changes(study).items()
+    ]
 
 
 def is_ours(study: optuna.Study) -> bool:

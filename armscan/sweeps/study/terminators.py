@@ -26,8 +26,14 @@ BETTER_PART = 0.5
 class Terminator(Protocol):
     """Rule that ends a study before its last trial."""
 
-    def check(self, n_objectives: int, n_seeds: int) -> None:
-        """Raise `InvalidValueError` if it does not support this number of objectives, or of seeds of a trial."""
+    def check(self, n_objectives: int, n_seeds: int, n_trials: int | None) -> None:
+        """Raise `InvalidValueError` if it can never end a study with these numbers.
+
+        Args:
+            n_objectives: Number of objectives.
+            n_seeds: Number of seeds of a trial.
+            n_trials: Number of trials; None if trials of other studies may add to them.
+        """
 
     def reason(self, study: optuna.Study, objectives: Sequence[str], state: StudyState) -> str | None:
         """Return why the study ends; None while it continues."""
@@ -49,8 +55,9 @@ class BelowSeedNoise:
     def __init__(self, min_trials: int = 20) -> None:
         self._min_trials = check_int("study.terminator.min_trials", min_trials, at_least=2)
 
-    def check(self, n_objectives: int, n_seeds: int) -> None:
+    def check(self, n_objectives: int, n_seeds: int, n_trials: int | None) -> None:
         """See `Terminator.check`."""
+        _check_enough("min_trials", self._min_trials, n_trials)
         if n_objectives > 1 or n_seeds < 2:
             given = f"{n_objectives} objectives" if n_objectives > 1 else "one seed"
             raise InvalidValueError(
@@ -94,8 +101,9 @@ class Stagnation:
     def __init__(self, n_trials: int = 30) -> None:
         self._n_trials = check_int("study.terminator.n_trials", n_trials, at_least=1)
 
-    def check(self, n_objectives: int, n_seeds: int) -> None:
+    def check(self, n_objectives: int, n_seeds: int, n_trials: int | None) -> None:
         """See `Terminator.check`."""
+        _check_enough("n_trials", self._n_trials, n_trials)
 
     def reason(self, study: optuna.Study, objectives: Sequence[str], state: StudyState) -> str | None:
         """See `Terminator.reason`."""
@@ -114,6 +122,15 @@ class Stagnation:
         return f"the last {self._n_trials} of {len(trials)} completed trials were no better than those before"
 
 
+def _check_enough(name: str, value: int, n_trials: int | None) -> None:
+    """Raise `InvalidValueError` unless a study has more trials than the terminator needs to end it."""
+    if n_trials is not None and value >= n_trials:
+        raise InvalidValueError(
+            f"study.terminator.{name} is {value}, but it must be less than study.n_trials ({n_trials}), or the study "
+            "could not end early"
+        )
+
+
 def seed_noise(trials: Sequence[FrozenTrial], objective: str, direction: StudyDirection) -> float | None:
     """Return the standard deviation of one training between seeds, pooled over the better half of the trials.
 
@@ -123,7 +140,7 @@ def seed_noise(trials: Sequence[FrozenTrial], objective: str, direction: StudyDi
         direction: Its direction.
 
     Returns:
-        The standard deviation; None if no trial has two seeds.
+        The standard deviation; None if no trial of the better half has two seeds.
     """
     ranked = sorted(trials, key=lambda trial: trial.values[0], reverse=direction == StudyDirection.MAXIMIZE)
     better = ranked[: max(1, round(BETTER_PART * len(ranked)))]

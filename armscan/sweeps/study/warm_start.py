@@ -34,7 +34,7 @@ from armscan.sweeps.storage.attributes import FINAL_SUFFIXES, check_trials
 from armscan.sweeps.storage.reports import REPORT
 from armscan.sweeps.storage.storage import Storage, existing_storage
 from armscan.sweeps.study.settings import StudySettings
-from armscan.sweeps.study.study import best_trials, comparable_settings, fixed_of, is_ours
+from armscan.sweeps.study.study import best_trials, comparable_settings, config_changes, fixed_of, is_ours
 from armscan.utils.text import counted
 
 PRESET, SOURCE = "preset {}", "study {}"
@@ -147,11 +147,14 @@ def _of_study(
     before, now = ({}, {}) if difference else map(_plain, fixed_of(source, wanted))
     fitting: list[tuple[FrozenTrial, dict[str, Value]]] = []
     misfits = Counter[str]()
+    first_number = max(config_changes(source), default=0)
     for trial in trials:
         params = renamed(trial.params)
         chosen, misfit = settings.space.fit(before | params, partly=bool(difference))
         if not difference:
             misfit = misfit or _not_searched(params, chosen, now)
+            # A value of an earlier configuration.
+            misfit = misfit or ("its study had another configuration then" if trial.number < first_number else None)
         if misfit:
             misfits[misfit] += 1
         else:

@@ -8,18 +8,18 @@ from pathlib import Path
 
 from armscan.agents import Learner
 from armscan.errors import CheckpointError, InvalidValueError
-from armscan.experiment.build import Experiment
+from armscan.experiment.build import RunSetup
 from armscan.sweeps.tasks.attempt import Attempt
 from armscan.training import EpochReport, take_over_checkpoints
 from armscan.utils.run_files import RUN_FILE
 
 
-def begin_generation(attempt: Attempt, setup: Experiment, folder: Path, *, run_id: str) -> list[EpochReport]:
+def begin_generation(attempt: Attempt, setup: RunSetup, folder: Path, *, run_id: str) -> list[EpochReport]:
     """Restore the parent trial's last checkpoint into an untrained agent; do nothing in the first generation.
 
     Args:
         attempt: The attempt at the trial.
-        setup: Experiment with the agent.
+        setup: Setup of the run, with the agent.
         folder: Folder of the training; takes the checkpoints.
         run_id: ID of its tracked run.
 

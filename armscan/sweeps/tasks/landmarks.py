@@ -29,7 +29,7 @@ class LandmarksTask:
     """
 
     def metrics(self, config: DictConfig) -> tuple[str, ...]:
-        """Return the means of both rewards over the volumes, their difference, and the worst at a labelled plane."""
+        """Return the names of the metrics: difference of both mean rewards, both means, worst labelled reward."""
         return METRICS
 
     @property
@@ -72,7 +72,7 @@ class LandmarksTask:
         return _metrics_of(self._rewards(attempt, part))
 
     def _rewards(self, attempt: Attempt, part: str) -> dict[str, tuple[float, float]]:
-        """Return the rewards at the labelled plane of each volume and, on average, elsewhere, as fitted to training."""
+        """Return each volume's reward at the labelled plane and its mean elsewhere; training volumes fit it."""
         config, _ = attempt.config(attempt.seeds[0])
         tissues, volumes = self._tissues(config), volumes_of(config).parts
         reward = instantiate(config.reward, _convert_="object").fit(volumes["training"].values(), tissues)

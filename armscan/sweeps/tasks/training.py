@@ -16,8 +16,8 @@ from armscan.agents import Learner
 from armscan.config.defaults import to_plain
 from armscan.errors import CheckpointError, InvalidValueError, TrackingError, TrackingUnavailableError
 from armscan.experiment.build import (
-    Experiment,
-    build_experiment,
+    RunSetup,
+    build_setup,
     check_each_seen,
     check_episodes,
     check_keys,
@@ -54,14 +54,14 @@ from armscan.utils.run_files import LAST_CHECKPOINT, LEARNING_CURVE_FILE, RUN_FI
 if TYPE_CHECKING:
     from mlflow.entities import Run
 
-Conclude = Callable[[Experiment, TrainingResult, TrackedRun, Path], dict[str, float]]
+Conclude = Callable[[RunSetup, TrainingResult, TrackedRun, Path], dict[str, float]]
 
 
 class TrainingTask:
     """The task of training an agent, with each of a trial's seeds."""
 
     def metrics(self, config: DictConfig) -> tuple[str, ...]:
-        """Return the metrics of the best validation, on-plane rates as configured, and of the training."""
+        """Return the names of the metrics of the best validation and of the training."""
         return (*Evaluation((), on_plane_of(config)).metrics(), *TRAINING_METRICS)
 
     @property
@@ -72,7 +72,7 @@ class TrainingTask:
     def check(self, config: DictConfig) -> None:
         """See `Task.check`."""
         check_keys(config)
-        experiment = build_experiment(config, volumes_of(config))
+        experiment = build_setup(config, volumes_of(config))
         if not isinstance(experiment.agent, Learner):
             raise InvalidValueError(
                 f"agent is {config.agent.get('_target_')!r}, but the trials of this study need one that learns"
@@ -106,7 +106,7 @@ class TrainingTask:
 
 
 def _evaluate_on_validation(
-    attempt: Attempt, setup: Experiment, result: TrainingResult, tracked: TrackedRun, folder: Path
+    attempt: Attempt, setup: RunSetup, result: TrainingResult, tracked: TrackedRun, folder: Path
 ) -> dict[str, float]:
     """Evaluate a trained agent on the validation volumes; return its metrics there."""
     seed, n_episodes = SELECTION_SEED + setup.seed, setup.n_episodes
@@ -120,7 +120,7 @@ def _evaluate_on_validation(
 
 
 def _evaluate_on_test(
-    attempt: Attempt, setup: Experiment, result: TrainingResult, tracked: TrackedRun, folder: Path
+    attempt: Attempt, setup: RunSetup, result: TrainingResult, tracked: TrackedRun, folder: Path
 ) -> dict[str, float]:
     """Evaluate a trained agent and the baselines, and store the results; return the metrics on the test volumes."""
     reached = RunResult.of(setup, result)
@@ -186,8 +186,8 @@ def _train(attempt: Attempt, seed: int, conclude: Conclude | None = None) -> dic
 
 
 def _start_or_resume(
-    attempt: Attempt, setup: Experiment, config: DictConfig, choices: dict[str, str], folder: Path
-) -> tuple[Experiment, TrackedRun, list[EpochReport]]:
+    attempt: Attempt, setup: RunSetup, config: DictConfig, choices: dict[str, str], folder: Path
+) -> tuple[RunSetup, TrackedRun, list[EpochReport]]:
     """Open the tracked run of a training, and restore the agent as an earlier attempt left it."""
     agent = setup.agent
     assert isinstance(agent, Learner)

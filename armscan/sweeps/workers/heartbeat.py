@@ -206,7 +206,8 @@ class Heartbeat:
         self._next_check_s = time.monotonic() + self._liveness.interval_s - HEARTBEAT_S / 2
         for trial in self._scheduler.reclaim(self._liveness.is_dead, state):
             self._on_death(trial)
-        self._limit = self._scheduler.stopped or self._scheduler.limits.limit_reason(state)
+        stopped = self._scheduler.stopped
+        self._limit = f"the study was stopped {stopped}" if stopped else self._scheduler.limits.limit_reason(state)
 
     def _is_own(self, trial: FrozenTrial) -> bool:
         return self._trial is not None and trial.number == self._trial.number

@@ -22,8 +22,8 @@ from armscan.sweeps.workers.slurm import NOW, SOON, SlurmSignals
 from armscan.utils.processes import ProcessInfo, child_command, on_parent_exit
 
 LAUNCHER_FILE, STOP_FILE, WORKER_FILES = "launcher.json", "stop", "worker-*.json"
-# Exit codes of a worker that was told to leave, of one whose storage was unavailable for too long, of one that cannot
-# work on the study as it is stored, and of all that are not restarted.
+# Exit codes of a worker that was told to leave, of one whose storage or tracking store was unavailable for
+# too long, of one that cannot work on the study as it is stored, and of all that are not restarted.
 LEFT, UNAVAILABLE, REFUSED = 130, 75, 65
 ENDS = (0, LEFT, UNAVAILABLE, REFUSED)
 GPUS, KEPT_GPUS, ALL_GPUS = "CUDA_VISIBLE_DEVICES", "ARMSCAN_GPUS", "all"

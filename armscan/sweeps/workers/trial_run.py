@@ -15,7 +15,7 @@ from armscan.sweeps.study.dashboard import note_run
 from armscan.sweeps.study.phase import Phase
 from armscan.sweeps.tasks.attempt import trial_folder
 from armscan.tracking import TrackedRun, run_of_study
-from armscan.tracking.tags import FOLDER_TAG, PARENT_TAG, STUDY_TAG, TRIAL_TAG
+from armscan.tracking.tags import FOLDER_TAG, OVERRIDES_TAG, PARENT_TAG, STUDY_TAG, TRIAL_TAG
 from armscan.utils.run_files import CONFIG_FILE, SHA256_TAGS
 
 
@@ -39,7 +39,7 @@ def open_run(
         **phase.tags_of(trial),
         SHA256_TAGS[CONFIG_FILE]: config_sha256,
         FOLDER_TAG: str(folder.resolve()),
-        "overrides": " ".join(overrides_of(values)),
+        OVERRIDES_TAG: " ".join(overrides_of(values)),
     }
     if RETRY_OF in attributes:
         tags["trial.retry_of"] = str(attributes[RETRY_OF])

@@ -109,7 +109,7 @@ def train_and_evaluate(
         study, and `test`, on the test volumes.
     """
     from armscan.config.compose import compose_run
-    from armscan.experiment.build import build_experiment
+    from armscan.experiment.build import build_setup
     from armscan.experiment.runner import train_agent
     from armscan.sweeps.space.parameter import overrides_of
     from armscan.sweeps.tasks.attempt import volumes_of
@@ -119,7 +119,7 @@ def train_and_evaluate(
 
     silence_libraries()
     config, _ = compose_run([*words, *overrides_of(values), f"seed={seed}"])
-    setup = build_experiment(config, volumes_of(config))
+    setup = build_setup(config, volumes_of(config))
     with tempfile.TemporaryDirectory() as folder:
         result = train_agent(setup, Path(folder), callbacks, run_id="bench", tell=lambda _: None)
     where = {SELECTION: (setup.validation_env, SELECTION_SEED), TEST: (setup.test_env, TEST_VOLUMES_SEED)}

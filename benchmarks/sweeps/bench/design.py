@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from optuna.distributions import BaseDistribution, CategoricalDistribution, IntDistribution
 from scipy.stats import qmc
 
-from armscan.config.compose import compose, of_run
+from armscan.config.compose import compose, reduce_to_run
 from armscan.sweeps.space.parameter import Value, optuna_value
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.tasks.attempt import config_sha256
@@ -51,7 +51,7 @@ class Design:
         space = Space.read(OmegaConf.to_container(config.study.space, resolve=True))
         if conditional := [each.name for each in space.parameters if each.when]:
             raise ValueError(f"sweep {sweep} searches {conditional[0]} only beside other values, which no bench does")
-        fixed, _ = of_run(config)
+        fixed, _ = reduce_to_run(config)
         points = sobol(len(space.parameters), n_configs - 1)
         return cls(sweep, space, (default_of(space, fixed), *(values_at(space, row) for row in points)), _sha256(fixed))
 

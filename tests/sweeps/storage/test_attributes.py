@@ -32,7 +32,7 @@ OF_LEASE = ["worker", "host", "pid", "started", "directory", "boot", "pid_namesp
 # Attributes of a study in which some of the odd values are harmless.
 HARMLESS_OF_STUDY = {
     *(names.STUDY_RUN, names.NOTE_SUM, names.BEGUN_WITH),
-    *(names.TERMINATED, names.RESET_FAILURES, names.STOP),
+    *(names.EARLIER_CONFIGS, names.TERMINATED, names.RESET_FAILURES, names.STOP),
 }
 ODD = [None, True, -1, 1.5, 10**400, "x", "\0", "\x1b[31m", [], ["x"], {}, {"a": 1}, {"a": None}, {"0": {"a": {}}}]
 

@@ -76,6 +76,14 @@ def test_study_goes_on_with_its_own_run(opened):
     assert opened().search.run_id == opened().search.run_id
 
 
+def test_run_of_a_study_shows_the_overrides_of_the_latest_command_and_not_those_of_its_workers(opened):
+    client, _ = opened.store
+    command = {"volumes": {}}
+    for overrides, given in ((["seed=1"], command), (["seed=2"], command), (["seed=2", "sampler.seed=3"], {})):
+        run_id = opened(overrides=overrides, **given).search.run_id
+    assert client.get_run(run_id).data.tags["overrides"] == "seed=2"
+
+
 def test_runs_of_a_study_of_the_same_name_in_another_storage_are_not_ended(opened):
     first, second = opened("first.journal").search, opened("second.journal").search
     client, experiment_id = opened.store

@@ -12,7 +12,7 @@ from armscan.sweeps.study.arguments import StudyCommand, trial_overrides
 from armscan.sweeps.study.components import read_settings
 from armscan.sweeps.study.final_eval_storage import open_final_eval
 from armscan.sweeps.study.settings import FinalEvalSettings, StudySettings
-from armscan.sweeps.study.study import LATER, existing_study, make_study
+from armscan.sweeps.study.study import LATER, change_notes, existing_study, make_study
 
 FIXED = {"agent": {"lr": 1e-3, "gamma": 0.9}, "seed": 3, "device": "cpu", "tracking": {"uri": "a"}}
 
@@ -154,6 +154,23 @@ def test_study_that_has_changed_goes_on_where_that_is_accepted_from_then_on(stor
     make_study(open_storage(storage_uri), settings(), FIXED | {"stack": 4})
     with pytest.raises(StudyError, match="stack was 4, is not there"):
         make_study(open_storage(storage_uri), settings(), FIXED)
+
+
+def test_change_of_a_configuration_is_noted_with_the_trials_that_had_the_earlier_one(storage_uri):
+    storage = open_storage(storage_uri)
+
+    def go_on(n_trials, **fixed):
+        study = make_study(storage, settings(allow_config_changes=True), FIXED | fixed)
+        for _ in range(n_trials):
+            study.tell(study.ask(), 1.0)
+        return change_notes(study)
+
+    assert go_on(0) == go_on(2, stack=4) == []
+    noted = "trials before 2 had another configuration (stack was 4, is 8), so their values do not compare with others"
+    assert go_on(0, stack=8) == [noted]
+    # Nothing was tried with 8.
+    assert go_on(1, stack=4) == []
+    assert go_on(0, stack=2) == [noted.replace("before 2", "before 3").replace("is 8", "is 2")]
 
 
 def test_study_of_an_earlier_version_goes_on_with_the_names_of_this_one(storage_uri):

@@ -167,10 +167,18 @@ def test_study_is_looked_at_once_for_each_number_of_finished_trials(make):
             "but the study has 2 objectives",
         ),
         (["study/terminator=stagnation", "study.terminator.n_trials=0"], "n_trials is 0, but it must be a whole"),
+        (
+            ["study/terminator=stagnation", "study.n_trials=30"],
+            r"study.terminator.n_trials is 30, but it must be less than study.n_trials \(30\)",
+        ),
+        (
+            ["study/terminator=noise", "study.seeds=[0,1]", "study.n_trials=8"],
+            r"study.terminator.min_trials is 20, but it must be less than study.n_trials \(8\)",
+        ),
         (["+study.terminator={_target_: builtins.dict}"], "study.terminator is builtins.dict, which has no check"),
         (["+study.terminator=3"], "study.terminator is 3, but it must be a section with a _target_, or null"),
     ],
-    ids=["one seed", "two objectives", "number", "class", "type"],
+    ids=["one seed", "two objectives", "number", "too few trials", "too few trials for noise", "class", "type"],
 )
 def test_terminator_that_cannot_work_is_refused(words, line):
     with pytest.raises(InvalidValueError, match=line):

@@ -99,6 +99,15 @@ def test_value_of_a_key_that_is_searched_no_more_must_be_the_fixed_one(study_in)
     assert told.endswith("0 taken with their values; 1 do not fit, such as: stack=4, which this study does not try")
 
 
+def test_values_from_before_a_change_of_the_configuration_are_not_taken(study_in):
+    study_in("before", {"agent.lr": LR}, ZY, rows=[({"agent.lr": 1e-3}, 3.0)])
+    study_in("before", {"agent.lr": LR}, rows=[({"agent.lr": 2e-3}, 2.0)], allow_config_changes=True)
+    made = study_in("now", {"agent.lr": LR}, warm_start=["before"])
+    (told,) = begin(made)
+    assert told.endswith("1 taken with their values; 1 do not fit, such as: its study had another configuration then")
+    assert [trial.values for trial in made[2].trials] == [[2.0]]
+
+
 @pytest.mark.parametrize(
     ("changes", "fixed", "why"),
     [
