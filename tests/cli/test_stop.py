@@ -45,7 +45,8 @@ def stops_of(study):
 
 
 def test_study_is_stopped_by_its_name_and_by_its_run(answer, study, run_with):
-    line = "study a: 1 running trial will be requeued at the next report; the command that started it resumes it\n"
+    requeued = "study a: 1 running trial will be requeued within ten seconds and an epoch"
+    line = f"{requeued}; the command that started it resumes it\n"
     assert answer("a") == (0, line, "")
     assert stops_of(study)[1]
     study.set_user_attr("stop", "")
@@ -60,7 +61,7 @@ def test_stopped_study_without_a_running_trial_says_so(answer, study):
 
 
 def test_trial_is_stopped_by_its_run(answer, study, run_with):
-    printed = "trial 0 of study a will end at its next report, as pruned; it counts as finished\n"
+    printed = "trial 0 of study a will end within ten seconds and an epoch, as pruned; it counts as finished\n"
     assert answer(run_with(study="a", trial="0")) == (0, printed, "")
     (of_trial, of_other), of_study = stops_of(study)
     assert of_trial

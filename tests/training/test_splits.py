@@ -230,7 +230,7 @@ def test_every_subject_is_tested_on_in_one_fold(folder, folds):
         ({"folds": 2, "fold": 0}, "of 0 volumes for training, .* give more subjects, more folds, or data.validation"),
         (
             {"folds": "leave_one_out"},
-            r"data.fold is None: give one fold, data\.fold=0 to \d+; armscan run makes a run of each",
+            r"data.fold is None: give one fold, data\.fold=0 to \d+. armscan run runs every fold",
         ),
         ({"folds": 5, "fold": 0}, r"data.folds is 5, but it must be .* at most 4"),
         ({"folds": 1, "fold": 0}, "data.folds is 1"),

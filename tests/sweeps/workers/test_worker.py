@@ -368,7 +368,9 @@ def test_stopped_trial_is_pruned_and_counts_as_finished(work, tmp_path, monkeypa
 
     def second_is_stopped(attempt):
         if attempt.trial.number == 1:
-            assert stop_trial(journal, "a", 1).startswith("trial 1 of study a will end at its next report, as pruned")
+            assert stop_trial(journal, "a", 1).startswith(
+                "trial 1 of study a will end within ten seconds and an epoch, as pruned"
+            )
             report_until_told_otherwise(attempt)
         return far_from_a_thousandth(attempt)
 
