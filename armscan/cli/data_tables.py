@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from rich.table import Column, Table
 from rich.text import Text
 
+from armscan.config.command_hints import armscan_command
 from armscan.errors import few, listed
 from armscan.utils.console import WHOLE_CHARS, print_sentence, print_table, wide_console
 from armscan.utils.text import counted
@@ -60,8 +61,6 @@ def print_dataset(dataset: Dataset, folder: Path) -> None:
         highlight=False,
     )
     if n_labelled < n_volumes:
-        from armscan.config.command_hints import armscan_command
-
         console.print(Text(f"find the missing planes: {armscan_command('data', 'label', str(folder))}"))
 
 
@@ -128,7 +127,6 @@ def _grid(shape: Sequence[int], spacing: Sequence[float]) -> str:
 def print_planes(options: LabellingOptions, labelled: Sequence[tuple[LabelVolume, FoundPlane]]) -> None:
     """Print a table of the planes, and the next steps to check them."""
     from armscan.anatomy import PIXEL_TISSUES, SUCCESS_THRESHOLD
-    from armscan.config.command_hints import armscan_command
     from armscan.volumes.markups import MARKUP_SUFFIX
 
     headings = ("score", "clusters", "rz, rx\n°", "tx, ty\nmm", "equally good\nrz, rx °, along mm")

@@ -18,8 +18,10 @@ from armscan.cli.options import (
     tracking_option,
     trust_option,
 )
+from armscan.config.defaults import CHANGES, default_tracking
 from armscan.errors import InvalidValueError
 from armscan.stats.on_plane import ON_PLANE_KEY
+from armscan.utils.console import wide_console
 from armscan.utils.validation import MAX_SEED
 
 if TYPE_CHECKING:
@@ -124,7 +126,6 @@ def evaluate(
     print(f"preparing {f'run {run[0]}' if agent is None else f'agent={agent}'}", flush=True)
     # Deferred: command-line errors are reported before these are loaded.
     from armscan import evaluation
-    from armscan.config.defaults import default_tracking
     from armscan.evaluation.runner import prepare_agent
     from armscan.experiment.job import check_choices
 
@@ -165,7 +166,6 @@ def _evaluate(
     from armscan.evaluation import report_tables
     from armscan.evaluation.track import evaluate_and_track
     from armscan.experiment.console import print_result_table, print_where_to_look
-    from armscan.utils.console import wide_console
 
     report, file = evaluate_and_track(prepared, store, n_episodes=n_episodes, seed=seed, changes=changes, out=out)
     console = wide_console()
@@ -203,8 +203,6 @@ def _check_words(run: Sequence[str], agent: str | None, data: str | None, change
         if len(run) != 1:
             raise click.UsageError("give one RUN, or --agent NAME")
         return
-    from armscan.config.defaults import CHANGES
-
     given = {CHANGES[name]: f"--{name.replace('_', '-')}" for name in changes}
     given |= dict.fromkeys(("data", "data.path"), "--data") if data is not None else {}
     for word in run:

@@ -12,6 +12,7 @@ from pathlib import Path
 import click
 
 from armscan.config.credentials import check_address
+from armscan.config.defaults import default_storage, default_tracking
 from armscan.errors import listed
 
 AGE = re.compile(r"(\d+(?:\.\d+)?)([mhdw])")
@@ -99,23 +100,11 @@ class Moment(click.ParamType[datetime]):
             )
 
 
-def _usual_tracking() -> str:
-    from armscan.config.defaults import default_tracking
-
-    return str(default_tracking()["uri"])
-
-
-def _usual_storage() -> str:
-    from armscan.config.defaults import default_storage
-
-    return default_storage()
-
-
 tracking_option = partial(
     click.option,
     "--tracking",
     type=UriParam(),
-    default=_usual_tracking,
+    default=lambda: str(default_tracking()["uri"]),
     show_default="MLFLOW_TRACKING_URI or sqlite:///mlruns.db",
     help="MLflow tracking store.",
 )
@@ -123,7 +112,7 @@ storage_option = partial(
     click.option,
     "--storage",
     type=UriParam(),
-    default=_usual_storage,
+    default=default_storage,
     show_default="ARMSCAN_STORAGE or optuna.journal",
     help="Optuna storage of the studies.",
 )

@@ -10,8 +10,9 @@ from pathlib import Path
 import click
 
 from armscan.cli.options import FILE_PATH, examples, is_given, storage_option, tracking_option
-from armscan.errors import InvalidValueError, StudyError, listed
+from armscan.errors import InvalidValueError, StorageUnavailableError, StudyError, listed
 from armscan.utils.files import nearest_existing
+from armscan.utils.retry import no_retry
 
 # Seconds between two updates of a watched report.
 WATCH_S = 10
@@ -70,9 +71,6 @@ def report(study: str | None, runs: str | None, out: Path | None, watch: bool, s
 
 def _watch(write: Callable[[int | None], Path]) -> None:
     """Rewrite a report until Ctrl-C, then write it once more, without the automatic refresh."""
-    from armscan.errors import StorageUnavailableError
-    from armscan.utils.retry import no_retry
-
     print(f"look at   {write(WATCH_S)}", f"updated every {WATCH_S} s until Ctrl-C", sep="\n", flush=True)
     try:
         while True:

@@ -21,7 +21,11 @@ from armscan.cli.options import (
     tracking_option,
     trust_option,
 )
+from armscan.config.command_hints import armscan_command
+from armscan.config.defaults import default_tracking
+from armscan.config.trust import check_stored_address
 from armscan.errors import TrackingError, printable
+from armscan.utils.processes import limit_threads
 from armscan.utils.text import counted
 
 if TYPE_CHECKING:
@@ -122,7 +126,6 @@ def prune(what: str, apply: bool, tracking: str, sort: str, limit: int | None, *
     """
     from rich.filesize import decimal
 
-    from armscan.config.command_hints import armscan_command
     from armscan.runs.prune import CHECKPOINTS, plan, remove_planned
     from armscan.runs.query import find_runs
     from armscan.runs.rows import RunRow, sort_rows
@@ -189,8 +192,6 @@ def sync(folder: Path, tracking: str | None, trust: bool) -> int:
     FOLDER is the folder of a run, of a study, or above them. Nothing is uploaded twice, and running runs upload
     by themselves. Exit code: 1 if something is left.
     """
-    from armscan.config.defaults import default_tracking
-    from armscan.config.trust import check_stored_address
     from armscan.tracking import open_existing_store
     from armscan.tracking import sync as upload_left
     from armscan.tracking.notes import notes
@@ -229,8 +230,6 @@ def reproduce(run: str, dry_run: bool, out: Path | None, tracking: str, trust: b
     of the old one, and is tracked beside it. Exit code: 0 if all metrics are equal (with --dry-run: if nothing
     differs), else 1.
     """
-    from armscan.utils.processes import limit_threads
-
     # As in `armscan run`.
     limit_threads()
     from armscan.runs import reproduce as reproduction
