@@ -8,6 +8,7 @@ from mlflow.entities import Run
 from rich.console import Console
 from rich.filesize import decimal
 from rich.markdown import Markdown
+from rich.table import Column
 from rich.text import Text
 
 from armscan.config.command_hints import armscan_command, resume_command
@@ -16,7 +17,7 @@ from armscan.errors import in_one_line, printable
 from armscan.experiment.results import BEST_VALIDATION, LAST_VALIDATION, evaluation_table, figures_of, result_table
 from armscan.runs.rows import RunRow, artifacts_of
 from armscan.runs.run_folder import OwnFolder, RunSkippedError
-from armscan.runs.tables import format_duration, narrow_table
+from armscan.runs.tables import format_duration
 from armscan.tracking import TrackingStore
 from armscan.tracking.tags import (
     AGENT_TAG,
@@ -30,7 +31,7 @@ from armscan.tracking.tags import (
     TRIAL_TAG,
 )
 from armscan.tracking.uploader import DESCRIPTION_SUM_TAG
-from armscan.utils.console import wide_console
+from armscan.utils.console import narrow_table, wide_console
 from armscan.utils.files import sha256
 from armscan.utils.run_files import BEST_CHECKPOINT, ID_CHARS, LAST_CHECKPOINT
 
@@ -57,7 +58,9 @@ def show(client: TrackingStore, run: Run, uri: str) -> None:
     children = client.children(run.info.experiment_id, run.info.run_id)
     if children:
         console.print("\nchildren", style="bold")
-        table = narrow_table("id", "name", "status")
+        table = narrow_table(
+            Column("id", no_wrap=True), Column("name", overflow="fold"), Column("status", no_wrap=True)
+        )
         for child in sorted(children, key=lambda child: child.info.start_time):
             table.add_row(child.info.run_id[:ID_CHARS], Text(printable(child.info.run_name)), child.info.status.lower())
         console.print(table)
@@ -81,11 +84,11 @@ def _facts(run: Run, entry: RunRow) -> dict[str, str]:
     return {name: value for name, value in facts.items() if name and value}
 
 
-def _print_pairs(console: Console, title: str, pairs: dict[str, str], right: str = "") -> None:
-    """Print names with their values; `right` is the heading of the values, > for numbers."""
+def _print_pairs(console: Console, title: str, pairs: dict[str, str], values: Column | None = None) -> None:
+    """Print names with their values, by default in a column that wraps."""
     if title:
         console.print(Text(f"\n{printable(title)}", style="bold"), soft_wrap=True)
-    table = narrow_table("", right)
+    table = narrow_table(Column(overflow="fold"), values or Column(overflow="fold"))
     table.show_header = False
     for name, value in pairs.items():
         whole = in_one_line(value)
@@ -135,7 +138,7 @@ def _print_folder(console: Console, run: Run) -> OwnFolder | None:
 
 def _print_sizes(console: Console, where: str, files: dict[str, int]) -> None:
     sizes = {name: decimal(n_bytes) for name, n_bytes in sorted(files.items())}
-    _print_pairs(console, f"{where}, {decimal(sum(files.values()))}", sizes, ">")
+    _print_pairs(console, f"{where}, {decimal(sum(files.values()))}", sizes, Column(justify="right", no_wrap=True))
 
 
 def _print_commands(console: Console, uri: str, run: Run, folder: OwnFolder | None, artifacts: Collection[str]) -> None:

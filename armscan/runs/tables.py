@@ -10,7 +10,7 @@ from typing import Any
 
 from mlflow.entities import Run
 from rich.filesize import decimal
-from rich.table import Column, Table
+from rich.table import Column
 from rich.text import Text
 
 from armscan.errors import printable
@@ -92,20 +92,6 @@ def shortened(name: str) -> str:
     """Return a name that is safe to show, and not too long for a line of a list."""
     name = printable(name)
     return name if len(name) <= MAX_NAME_CHARS else f"{name[: MAX_NAME_CHARS - 1]}…"
-
-
-def narrow_table(*headings: str) -> Table:
-    """Return a table without rules; a heading that ends in > is of numbers."""
-    table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False)
-    for heading in headings:
-        is_name = heading in ("name", "")
-        table.add_column(
-            heading.rstrip(">"),
-            justify="right" if heading.endswith(">") else "left",
-            no_wrap=not is_name,
-            overflow="fold",
-        )
-    return table
 
 
 COLUMNS = (

@@ -52,10 +52,13 @@ def print_table(heading: str, names: Sequence[str], columns: Sequence[Column], r
         console.print(Text.assemble(*((segment.text, segment.style or "") for segment in line)), soft_wrap=True)
 
 
+def narrow_table(*columns: Column) -> Table:
+    """Return an empty table without rules."""
+    return Table(*columns, box=None, padding=(0, 1, 0, 0), pad_edge=False)
+
+
 def _table(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> Table:
-    table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False)
-    for column in columns:
-        table.add_column(column.header, justify=column.justify, no_wrap=True)
+    table = narrow_table(*(Column(each.header, justify=each.justify, no_wrap=True) for each in columns))
     for row in rows:
         table.add_row(*map(Text, row))
     return table
