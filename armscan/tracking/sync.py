@@ -79,7 +79,7 @@ def _synced(files: Iterable[Path], opened: Callable[[str], TrackingStore], *, tr
         try:
             with contextlib.closing(Outbox(file, timeout_s=0.0)) as outbox:
                 run_id, uri = outbox.address.run_id, outbox.address.uri
-                is_open = outbox.status not in ENDED and _is_dead(run_id, file)
+                is_open = outbox.status not in ENDED and (note := _note_of(file)) is not None and note.is_dead
                 if outbox.is_uploaded and not is_open:
                     continue
                 if isinstance(store := stores.get(uri) or _opened(opened, uri), TrackingError):
@@ -88,7 +88,8 @@ def _synced(files: Iterable[Path], opened: Callable[[str], TrackingStore], *, tr
                     uploads.append(_upload_of(outbox, store, is_open=is_open, trust=trust))
                 stores[uri] = store
         except FileNotFoundError:
-            if _is_dead(file.stem, file) and (left := _end_removed(file.stem, opened)) is not None:
+            note = _note_of(file)
+            if note is not None and note.is_dead and (left := _end_removed(file.stem, note, opened)) is not None:
                 uploads.append(Upload(file.parent.parent, file.stem, 0, left))
         except FolderInUseError:
             uploads.append(Upload(file.parent.parent, None, 0, IN_USE))
@@ -97,16 +98,14 @@ def _synced(files: Iterable[Path], opened: Callable[[str], TrackingStore], *, tr
     return uploads
 
 
-def _is_dead(run_id: str, file: Path) -> bool:
-    """Return whether the process that wrote this outbox of a run has died on this machine."""
-    note = Note.of(run_id)
-    return note is not None and note.is_dead and note.outbox.resolve() == file.resolve()
+def _note_of(file: Path) -> Note | None:
+    """Return this machine's note of the run with this outbox; None if there is none, or it is of another outbox."""
+    note = Note.of(file.stem)
+    return note if note is not None and note.outbox.resolve() == file.resolve() else None
 
 
-def _end_removed(run_id: str, opened: Callable[[str], TrackingStore]) -> str | None:
+def _end_removed(run_id: str, note: Note, opened: Callable[[str], TrackingStore]) -> str | None:
     """Close a run as FAILED: its process died and its folder was removed; return why that is impossible, if it is."""
-    note = Note.of(run_id)
-    assert note is not None
     try:
         client = opened(note.uri).mlflow
         run = client.get_run(run_id)
@@ -163,12 +162,8 @@ def _end(outbox: Outbox, run: Run) -> None:
 
 def _check_own(outbox: Outbox, run: Run) -> None:
     """Raise `UntrustedError` unless the run was tracked from this folder, which could name any other."""
-    folder = outbox.folder.resolve()
-    note = Note.of(run.info.run_id)
-    if note is not None and note.outbox.resolve() == outbox.file.resolve():
-        return
-    noted = run.data.tags.get(FOLDER_TAG)
-    if noted != str(folder):
+    folder, noted = outbox.folder.resolve(), run.data.tags.get(FOLDER_TAG)
+    if noted != str(folder) and _note_of(outbox.file) is None:
         raise UntrustedError(
             f"the run was not tracked from here on this machine, and its own folder is {noted or 'not known'}; if you "
             f"trust the author of {folder}, add {TRUST}"
