@@ -31,13 +31,14 @@ from armscan.experiment.job import (
     remove_run_folder,
 )
 from armscan.launch.launchers import LAUNCHER, check_launcher, prepare_launcher
+from armscan.tracking import TrackingStore, begin_outbox, code_state, note_end, open_store, sync
+from armscan.tracking.sync import PROCESS_DIED
 from armscan.tracking.tags import FAILURE_TAG, FOLDER_TAG, GRID_TAG, JOB_TAG
 from armscan.utils.run_files import LAST_CHECKPOINT, RESULTS_PAGE
 
 if TYPE_CHECKING:
     from mlflow.entities import Run
 
-    from armscan.tracking import TrackingStore
     from armscan.tracking.outbox import Outbox
 
 # Hydra's own overrides that select the multirun mode and its folder.
@@ -81,9 +82,6 @@ class Multirun(Callback):
         prepare_launcher(launcher)
         folder = Path(config.hydra.sweep.dir)
         print(f"preparing a grid in {folder}", flush=True)
-        # Deferred: it loads MLflow, after the first line is printed.
-        from armscan.tracking import begin_outbox, code_state, open_store
-
         if not isinstance(config.tracking, DictConfig):
             raise InvalidValueError(f"tracking is {config.tracking!r}, but it must be a section, such as its default")
         tracking = to_plain(config.tracking)
@@ -215,8 +213,6 @@ def _close_parent(
         The tracking store, and the runs of the jobs that started one, in the order of the jobs.
     """
     from armscan.launch.best_job import show_best
-    from armscan.tracking import note_end, open_store, sync
-    from armscan.tracking.sync import PROCESS_DIED
 
     failed = {number: each for number, each in outcomes.items() if each.failure not in (None, INTERRUPTED)}
     tags = {f"failure.{number}": f"{each.varied}: {each.failure}" for number, each in failed.items()}
