@@ -35,8 +35,9 @@ class Note:
     process: ProcessInfo
 
     @classmethod
-    def read(cls, file: Path) -> Self | None:
-        """Return the note in a file, None if there is none; an earlier version's note is a link to the outbox."""
+    def of(cls, run_id: str) -> Self | None:
+        """Return the note of a run, None if there is none; an earlier version's note is a link to the outbox."""
+        file = cache_folder() / NOTES_FOLDER / run_id
         try:
             if file.is_symlink():
                 return cls(file.readlink(), "", ProcessInfo.of({}))
@@ -44,11 +45,6 @@ class Note:
             return cls(Path(told["outbox"]), str(told["uri"]), ProcessInfo.of(told["process"]))
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             return None
-
-    @classmethod
-    def of(cls, run_id: str) -> Self | None:
-        """Return the note of a run, None if there is none."""
-        return cls.read(cache_folder() / NOTES_FOLDER / run_id)
 
     def write(self, file: Path) -> None:
         """Write the note to a file."""
@@ -63,5 +59,5 @@ class Note:
 
 def notes() -> dict[str, Note]:
     """Return this machine's notes by run ID."""
-    files = sorted((cache_folder() / NOTES_FOLDER).glob("*"))
-    return {file.name: note for file in files if (note := Note.read(file)) is not None}
+    names = sorted(file.name for file in (cache_folder() / NOTES_FOLDER).glob("*"))
+    return {name: note for name in names if (note := Note.of(name)) is not None}
