@@ -91,8 +91,6 @@ def _git(folder: Path, *arguments: str, index: Path | None = None, given: bytes 
     variables = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
     if index is not None:
         variables["GIT_INDEX_FILE"] = str(index)
-    words = ["git", *arguments]
-    answer = subprocess.run(
-        words, cwd=folder, input=given, capture_output=True, timeout=TIMEOUT_S, check=True, env=variables
-    )
-    return answer.stdout
+    return subprocess.run(
+        ["git", *arguments], cwd=folder, input=given, capture_output=True, timeout=TIMEOUT_S, check=True, env=variables
+    ).stdout
