@@ -12,7 +12,6 @@ from armscan.training.baselines import RANDOM
 from armscan.training.headline import beside_random, headline
 from armscan.utils.run_files import BASELINES_FILE, EVALUATION_FILE
 
-SEED = "seed"
 ALL_FOLDS = ", all folds"
 AGENT = f"agent{ALL_FOLDS}"
 
@@ -32,7 +31,7 @@ def folds_table(runs: Iterable[tuple[Path, Sequence[str]]], n_folds: int | None 
         words = dict(word.partition("=")[::2] for word in varied)
         if (fold := words.pop(FOLD, None)) is None:
             return None
-        training = words.pop(SEED, "")
+        training = words.pop("seed", "")
         others = " ".join(f"{key}={value}" for key, value in words.items())
         for name, evaluation in _evaluations(folder).items():
             title = ", ".join(filter(None, (name, others)))
@@ -64,7 +63,7 @@ def folds_table(runs: Iterable[tuple[Path, Sequence[str]]], n_folds: int | None 
         {title.replace(ALL_FOLDS, which, 1): of_title for title, of_title in each.items()}
         for each in (figures, ours, randoms)
     )
-    return ResultTable(figures | ours, headline=headline(ours, randoms)) if figures else None
+    return ResultTable(figures | ours, headline=headline(ours, randoms))
 
 
 def _evaluations(folder: Path) -> dict[str, Evaluation]:
