@@ -59,7 +59,6 @@ HOW_BETTER = (
 MANY_PAIRS = 12
 # With more groups, nobody can tell the bands apart.
 MAX_DETAILED = 24
-LEADING = "on-plane rate"
 
 
 def write_comparison(groups: Sequence[Group], left_out: Sequence[TrackedTraining], title: str, folder: Path) -> Path:
@@ -193,7 +192,7 @@ def _better(groups: Sequence[Group], pairs: Mapping[str, Sequence[Pair]]) -> Ite
         return
     matrices = []
     for figure, of_figure in pairs.items():
-        heading = f"By {LEADING if figure == 'on_plane_rate' else title_of(figure)}: "
+        heading = f"By {'on-plane rate' if figure == 'on_plane_rate' else title_of(figure)}: "
         heading += f"{'higher' if COMPARED_BY[figure] else 'lower'} is better"
         matrices.append(f"<div><h3>{heading}</h3>{_matrix(groups, of_figure)}</div>")
     # One seed has no interval, so its pairs are never bold.
