@@ -142,7 +142,16 @@ def reduce_to_run(config: DictConfig) -> tuple[DictConfig, dict[str, str]]:
 
 
 def build_section(config: DictConfig, section: str, kind: type[T]) -> T:
-    """Build the object of a configuration section, which must be of this class."""
+    """Build the object of a section of a configuration.
+
+    Args:
+        config: Configuration.
+        section: Key of the section.
+        kind: Class of the object.
+
+    Raises:
+        InvalidValueError: If the section builds an object of another class.
+    """
     built = instantiate(config[section], _convert_="object")
     if not isinstance(built, kind):
         raise InvalidValueError(f"{section} builds {built!r}, but it must build a {kind.__name__}")

@@ -63,7 +63,11 @@ def check_words(words: Sequence[str]) -> None:
 
 
 def read_password(variable: str) -> str | None:
-    """Return a password from an environment variable, or from the file that `{variable}_FILE` names; None if unset."""
+    """Return a password from an environment variable, or from the file that `{variable}_FILE` names; None if unset.
+
+    Raises:
+        InvalidValueError: If the file cannot be read or is empty.
+    """
     if password := os.environ.get(variable):
         return password
     name = variable + FILE_SUFFIX

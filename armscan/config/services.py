@@ -51,7 +51,11 @@ def address_of(name: str, default: str | None = None) -> str:
 
 
 def local_addresses() -> dict[str, str]:
-    """Return the addresses in `services_file` by service; empty if there is no such file."""
+    """Return the addresses in `services_file` by service; empty if there is no such file.
+
+    Raises:
+        InvalidValueError: If the file cannot be read, or has other keys or values.
+    """
     file = services_file()
     try:
         addresses = yaml.safe_load(file.read_bytes()) or {}

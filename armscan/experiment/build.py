@@ -116,7 +116,15 @@ def set_up(config: DictConfig) -> RunSetup:
 
 
 def build_setup(config: DictConfig, split: Split | None = None) -> RunSetup:
-    """Build the setup of a run from its composed configuration; without `split`, the volumes are read too."""
+    """Build the setup of a run.
+
+    Args:
+        config: Composed configuration of the run.
+        split: Its volumes. Default: None, they are read.
+
+    Raises:
+        ArmscanError: If the configuration or a volume is refused.
+    """
     check_config(config)
     budget = build_section(config, "training", Budget)
     split = split or build_section(config, "data", Split)
@@ -157,7 +165,17 @@ def check_episodes(setup: RunSetup) -> None:
 
 
 def check_each_seen(key: str, n_episodes: int, part: str, split: Split) -> None:
-    """Raise `InvalidValueError` if there are fewer episodes than volumes in a part of a split."""
+    """Check that each volume of a part of a split has an episode.
+
+    Args:
+        key: Key of the configuration that sets the number of episodes, for errors.
+        n_episodes: Number of episodes.
+        part: Part of the split, such as `validation`.
+        split: Volumes of the run.
+
+    Raises:
+        InvalidValueError: If there are fewer episodes than volumes.
+    """
     n_volumes = len(split.parts[part])
     if n_episodes < n_volumes:
         least = f"at least {n_volumes}: one for each {part} volume"
@@ -225,7 +243,13 @@ def on_plane_of(config: DictConfig) -> tuple[OnPlane, ...]:
 
 
 def apply_crop(config: DictConfig, trained_px: tuple[int, int], here_px: tuple[int, int]) -> DictConfig:
-    """Return the configuration with images cropped alike on all volumes; see `with_crops`."""
+    """Return the configuration with images cropped alike on all volumes; see `with_crops`.
+
+    Args:
+        config: Configuration of the run.
+        trained_px: Smallest slice that the agent was trained on, (across, depth) in pixels.
+        here_px: Smallest slice of the volumes at hand, likewise.
+    """
     node = config.env.observation
     rules = OmegaConf.to_container(node) if OmegaConf.is_config(node) else node
     cropped = config.copy()

@@ -21,7 +21,7 @@ from armscan.config.command_hints import kept_command
 from armscan.config.defaults import CHOICES
 from armscan.errors import FolderInUseError, FolderTakenError, InvalidValueError
 from armscan.utils.files import atomic_write, sha256
-from armscan.utils.run_files import CONFIG_FILE, LOCK_FILE, OUTBOX_FOLDER, OUTBOX_SUFFIXES, RUN_ID
+from armscan.utils.run_files import CONFIG_FILE, LOCK_FILE, OUTBOX_FOLDER, OUTBOX_SUFFIXES, RUN_ID_PATTERN
 
 PARENT_FILE = "parent_run.json"
 OUTCOME_FOLDER = "outcomes"
@@ -169,7 +169,7 @@ def remove_run_folder(folder: Path) -> None:
     """
     for ours in (folder / ".hydra", folder / OUTCOME_FOLDER):
         shutil.rmtree(ours, ignore_errors=True)
-    outboxes = [file for suffix in OUTBOX_SUFFIXES for file in (folder / OUTBOX_FOLDER).glob(RUN_ID + suffix)]
+    outboxes = [file for suffix in OUTBOX_SUFFIXES for file in (folder / OUTBOX_FOLDER).glob(RUN_ID_PATTERN + suffix)]
     for ours in (folder / PARENT_FILE, folder / "multirun.yaml", folder / LOCK_FILE, *outboxes):
         ours.unlink(missing_ok=True)
     # Another run's outbox is not empty.

@@ -157,7 +157,18 @@ def train_agent(
     earlier: Sequence[EpochReport] = (),
     until_env_steps: int | None = None,
 ) -> TrainingResult:
-    """Train the agent of a setup, which must be a `Learner`, and tell how its updates are computed; see `train`."""
+    """Train the agent of a setup, and tell how its updates are computed; see `train`.
+
+    Args:
+        setup: Setup of the run, whose agent is a `Learner`.
+        folder: Folder of its checkpoints.
+        callbacks: Callbacks of the training.
+        run_id: MLflow run ID, kept in the checkpoints.
+        tell: Receives lines for the user.
+        earlier: Epochs of a training that is resumed. Default: none.
+        until_env_steps: Environment steps at which to stop, before the budget is spent. Default: None, the whole
+            budget.
+    """
     agent, budget = setup.agent, setup.budget
     assert isinstance(agent, Learner)
     if note := agent.update_note:

@@ -31,10 +31,15 @@ def best_of(runs: Sequence[Run]) -> Run | None:
     return max(evaluated, key=lambda run: float(run.data.metrics[rate]), default=None)
 
 
-def show_best(store: TrackingStore, parent_id: str, jobs: Sequence[Run]) -> None:
-    """Log the leading figures of the best job, its random agent and their limits to a grid's run, by the same names.
+def log_best(store: TrackingStore, parent_id: str, jobs: Sequence[Run]) -> None:
+    """Log the leading figures of a grid's best job, and of random planes, to the grid's run, by the same names.
 
-    If jobs have different tasks or test volumes, only the limits.
+    If jobs have different tasks or test volumes, only the limits of an on-plane rate are logged.
+
+    Args:
+        store: Tracking store of the grid.
+        parent_id: MLflow run ID of the grid.
+        jobs: Runs of its jobs.
     """
     if (best := best_of(jobs)) is None:
         return

@@ -212,7 +212,7 @@ def _close_parent(
     Returns:
         The tracking store, and the runs of the jobs that started one, in the order of the jobs.
     """
-    from armscan.launch.best_job import show_best
+    from armscan.launch.best_job import log_best
 
     failed = {number: each for number, each in outcomes.items() if each.failure not in (None, INTERRUPTED)}
     tags = {f"failure.{number}": f"{each.varied}: {each.failure}" for number, each in failed.items()}
@@ -235,5 +235,5 @@ def _close_parent(
     if not children:
         store.delete_run(parent["run_id"])
     else:
-        show_best(store, parent["run_id"], children)
+        log_best(store, parent["run_id"], children)
     return store, sorted(children, key=lambda child: int(child.data.tags[JOB_TAG]))

@@ -116,7 +116,13 @@ def compare_runs(store: TrackingStore, first_id: str, second_id: str) -> Compari
 
 
 def difference(metric: str, then: Mapping[int, float], now: Mapping[int, float]) -> Difference:
-    """Return how one metric differs between two runs, each given by its values at environment steps."""
+    """Return how a metric differs between two runs.
+
+    Args:
+        metric: Name of the metric.
+        then: Values of the original run by environment step.
+        now: Values of the other run by environment step.
+    """
     common = sorted(then.keys() & now.keys())
     n_missing, n_new = len(then.keys() - now.keys()), len(now.keys() - then.keys())
     if not common:

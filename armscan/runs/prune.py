@@ -40,7 +40,16 @@ class PruneItem:
 
 
 def plan(client: TrackingStore, runs: Sequence[Run], what: str) -> list[PruneItem]:
-    """Plan the removal of the `CHECKPOINTS` or `FOLDERS` of runs; remove nothing."""
+    """Plan the removal of files of runs; remove nothing.
+
+    Args:
+        client: Tracking store of the runs.
+        runs: Runs whose files are to be removed.
+        what: `CHECKPOINTS`, or `FOLDERS` for all files of a run.
+
+    Returns:
+        The plan of each run: the bytes that it would free, or the reason why its files stay.
+    """
     everything = {run.info.run_id: run for run in client.runs(experiment_ids(client))}
     noted = defaultdict(set)
     for run_id, run in everything.items():
@@ -61,6 +70,11 @@ def plan(client: TrackingStore, runs: Sequence[Run], what: str) -> list[PruneIte
 
 def remove(client: TrackingStore, item: PruneItem, what: str) -> str | None:
     """Remove the files of a run that a plan names.
+
+    Args:
+        client: Tracking store of the run.
+        item: Plan of the run; one that says why its files stay is not allowed.
+        what: `CHECKPOINTS` or `FOLDERS`, as in the plan.
 
     Returns:
         Reason why the folder is still there; None if it is gone, or only checkpoints were to be removed.

@@ -85,7 +85,15 @@ def _projection_params(text: str) -> tuple[str, ...]:
 
 
 def experiment_ids(client: TrackingStore, name: str | None = None) -> list[str]:
-    """Return the IDs of all experiments of a store, or of the one with this name, which must exist."""
+    """Return the IDs of experiments.
+
+    Args:
+        client: Tracking store of the experiments.
+        name: Name of the only experiment. Default: None, all of the store.
+
+    Raises:
+        InvalidValueError: If there is no experiment with this name.
+    """
     experiments = all_pages(client.search_experiments)
     found = [each.experiment_id for each in experiments if name in (None, each.name)]
     if not found and name is not None:

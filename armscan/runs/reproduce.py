@@ -54,6 +54,11 @@ class Original:
 def load_original(tracking: str, run_id: str, *, trust: bool = False) -> Original:
     """Return a tracked run, ready to be reproduced.
 
+    Args:
+        tracking: Address of the tracking store.
+        run_id: MLflow run ID.
+        trust: Whether its configuration may build any class. Default: False, only armscan's own.
+
     Raises:
         ArmscanError: If there is no such run, it was not made by `armscan run`, it has not ended, its files are missing
             or changed, or its volumes have changed since it was started.
@@ -140,6 +145,9 @@ def reproduce(original: Original, folder: Path, differing: Sequence[str]) -> Com
 
     Returns:
         The comparison of all metrics, except those of time and machine.
+
+    Raises:
+        InvalidValueError: If the folder is not empty.
     """
     run = original.run
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):

@@ -24,7 +24,6 @@ from armscan.sweeps.study.warm_start import initial_trials
 from armscan.sweeps.tasks.attempt import volume_sums, volumes_of
 from armscan.sweeps.workers.launch import run_workers
 from armscan.utils.console import print_sentence
-from armscan.utils.log import silence_libraries
 from armscan.utils.processes import n_usable_cores
 from armscan.utils.text import counted
 
@@ -37,7 +36,6 @@ def run_study(arguments: Sequence[str], launch: Callable[[Sequence[str]], object
         workers gave up, and the same command resumes it; else 1.
     """
     given = StudyCommand.read(arguments)
-    silence_libraries()
     overrides = trial_overrides(given.overrides)
     settings, task, config = read_settings(overrides)
     for key, uri in ((STORAGE, settings.storage), (TRACKING_URI, config.tracking.uri)):

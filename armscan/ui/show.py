@@ -35,9 +35,12 @@ def show(
         storage: Optuna storage of the studies.
         tracking: MLflow tracking store of the runs.
         artifacts: Folder of the plots that the dashboard shows.
-        mlflow_port: Port of MLflow's UI.
-        dashboard_port: Port of Optuna's dashboard.
+        mlflow_port: Port of MLflow's UI, from 1 to 65,535.
+        dashboard_port: Port of Optuna's dashboard, likewise.
         named: Options given on the command line, `--storage` or `--tracking`; these stores must exist.
+
+    Raises:
+        InvalidValueError: If there is nothing to show, a named store does not exist, or a port cannot be used.
     """
     # Deferred: a mistake on the command line should be reported before this is loaded.
     from armscan.sweeps.storage.storage import existing_storage

@@ -43,7 +43,7 @@ LOCK_FILE = ".lock"
 OUTBOX_FOLDER = "tracking"
 # Of the files of a run's outbox, named after the run: the uploaded position, the lock, and the entries.
 OUTBOX_SUFFIXES = (".delivered.json", ".lock", ".jsonl")
-RUN_ID = "[0-9a-f]" * 32
+RUN_ID_PATTERN = "[0-9a-f]" * 32
 
 
 def is_made_by_run(name: str) -> bool:
@@ -58,7 +58,7 @@ def is_made_by_run(name: str) -> bool:
 def check_free(folder: Path) -> None:
     """Raise `FolderTakenError` if a folder has a file named like a run's, but not made by a run."""
     # An earlier run that was never tracked has left its start files, the first three of which come together.
-    outboxes = (folder / OUTBOX_FOLDER).glob(RUN_ID + OUTBOX_SUFFIXES[-1])
+    outboxes = (folder / OUTBOX_FOLDER).glob(RUN_ID_PATTERN + OUTBOX_SUFFIXES[-1])
     if any(outboxes) or all((folder / name).is_file() for name in STARTED_WITH[:3]):
         return
     # Broken links count, too.

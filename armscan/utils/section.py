@@ -19,7 +19,15 @@ class Section(BaseModel):
 
     @classmethod
     def read(cls, where: str, values: Mapping[str, Any]) -> Self:
-        """Return the section with these values; `where` is its place in the configuration, for messages."""
+        """Return the section with these values.
+
+        Args:
+            where: Key of the section in the configuration, for errors.
+            values: Values by key.
+
+        Raises:
+            InvalidValueError: If a key is missing or unknown, or a value is not allowed.
+        """
         try:
             return cls.model_validate(values)
         except ValidationError as error:

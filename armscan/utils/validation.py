@@ -18,7 +18,17 @@ MAX_SEED = 2**31 - 1
 
 
 def check_int(name: str, value: Any, *, at_least: int, at_most: int | None = None) -> int:
-    """Return `value` as an int if it is a whole number within the given bounds."""
+    """Return a checked whole number.
+
+    Args:
+        name: Name of the argument, for errors.
+        value: Value to check; truth values are refused.
+        at_least: Smallest allowed value.
+        at_most: Largest allowed value. Default: None, no limit.
+
+    Raises:
+        InvalidValueError: If the value is not a whole number within the bounds.
+    """
     is_whole = isinstance(value, Integral) and not isinstance(value, bool)
     if not is_whole or value < at_least or (at_most is not None and value > at_most):
         above = "" if at_most is None else f" and at most {at_most}"
@@ -39,7 +49,18 @@ def check_float(
     at_least: float = -math.inf,
     at_most: float = math.inf,
 ) -> float:
-    """Return `value` as a float if it is finite, > `above`, >= `at_least` and <= `at_most`."""
+    """Return a checked finite number.
+
+    Args:
+        name: Name of the argument, for errors.
+        value: Value to check; truth values are refused.
+        above: Bound that the value must exceed. Default: none.
+        at_least: Smallest allowed value. Default: no limit.
+        at_most: Largest allowed value. Default: no limit.
+
+    Raises:
+        InvalidValueError: If the value is not a finite number within the bounds.
+    """
     bounds = [
         f"{word} {bound:g}"
         for word, bound in (("above", above), ("at least", at_least), ("at most", at_most))

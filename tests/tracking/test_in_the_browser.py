@@ -6,7 +6,7 @@ from functools import partial
 import pytest
 from mlflow.entities import Metric, Param
 
-from armscan.launch.best_job import show_best
+from armscan.launch.best_job import log_best
 from armscan.stats.on_plane import leading_of
 from armscan.tracking import TrackedRun
 from armscan.tracking.tags import BEST_TAG
@@ -66,7 +66,7 @@ def test_run_of_a_grid_shows_the_figures_of_its_best_job(store):
             Metric(f"{RATE}_low", 0.1, 1, 5),
         ]
         client.log_batch(job, metrics=metrics)
-    show_best(client, parent, [client.get_run(job) for job in jobs])
+    log_best(client, parent, [client.get_run(job) for job in jobs])
     run = client.get_run(parent)
     assert run.data.metrics == {RATE: 0.75, STEPS: 3.0, RANDOM_RATE: 0.2}
     assert run.data.tags[BEST_TAG] == jobs[1]
@@ -78,7 +78,7 @@ def test_run_of_a_grid_over_tasks_shows_no_best_job(store, key):
     parent, *jobs = (client.create_run(experiment_id, name=name, tags={}).info.run_id for name in ("parent", "a", "b"))
     for number, job in enumerate(jobs):
         client.log_batch(job, metrics=[Metric(RATE, 0.5, 1, 5)], params=[Param(key, str(number))])
-    show_best(client, parent, [client.get_run(job) for job in jobs])
+    log_best(client, parent, [client.get_run(job) for job in jobs])
     assert client.get_run(parent).data.metrics == {}
 
 
@@ -89,14 +89,14 @@ def test_run_of_a_grid_has_the_limits_of_its_jobs(store, projections):
     for job, projection in zip(jobs, projections, strict=True):
         params = [Param("evaluation.on_plane", "[[2, 5]]"), Param("projection", projection)]
         client.log_batch(job, metrics=[Metric("test_volumes/on_plane_2mm_5deg", 0.5, 1, 5)], params=params)
-    show_best(client, parent, [client.get_run(job) for job in jobs])
+    log_best(client, parent, [client.get_run(job) for job in jobs])
     assert leading_of(client.get_run(parent).data.params) == (2, 5)
 
 
 def test_run_of_a_grid_without_evaluated_jobs_shows_nothing(store):
     client, experiment_id = store()
     parent = client.create_run(experiment_id, name="parent", tags={}).info.run_id
-    show_best(client, parent, [client.get_run(parent)])
+    log_best(client, parent, [client.get_run(parent)])
     assert client.get_run(parent).data.metrics == {}
 
 

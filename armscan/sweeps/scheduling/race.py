@@ -138,7 +138,13 @@ def race(scores: Scores, seeds: Sequence[int], *, min_seeds: int, mean_seeds: in
 
 
 def budget(n_configurations: int, *, min_seeds: int, mean_seeds: int) -> tuple[int, int]:
-    """Return a lower and an upper bound on the number of trainings of a race in which none fails."""
+    """Return a lower and an upper bound on the number of trainings of a race in which none fails.
+
+    Args:
+        n_configurations: Number of candidates, and the control.
+        min_seeds: Seeds of each at first.
+        mean_seeds: Seeds of each on average, at most.
+    """
     if n_configurations == 1:
         return min_seeds, min_seeds
     least, most, size = n_configurations * min_seeds, n_configurations * mean_seeds, round_size(n_configurations)

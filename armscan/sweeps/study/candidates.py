@@ -45,6 +45,12 @@ def settings_of(searched: Sequence[FrozenTrial], number: int) -> dict[str, Any]:
 
 
 def attributes_of(searched: Sequence[FrozenTrial], number: int, seed: int) -> dict[str, Any]:
-    """Return the user attributes of a final training; see `training_of`."""
+    """Return the user attributes of a final training; see `training_of`.
+
+    Args:
+        searched: Trials of the search.
+        number: Number of one of them, or `CONTROL`.
+        seed: Seed of the training.
+    """
     schedule = [] if number == CONTROL else searched[number].user_attrs.get(SCHEDULE, [])
     return {FINALIST: number, FINAL_SEED: seed} | ({SCHEDULE: schedule} if schedule else {})

@@ -19,6 +19,7 @@ from typing import BinaryIO
 from armscan.errors import ArmscanError, ServiceUnavailableError, StudyError
 from armscan.sweeps.workers.leave_request import LeaveRequest
 from armscan.sweeps.workers.slurm import NOW, SOON, SlurmSignals
+from armscan.utils.log import log
 from armscan.utils.processes import ProcessInfo, child_command, on_parent_exit
 
 LAUNCHER_FILE, STOP_FILE, WORKER_FILES = "launcher.json", "stop", "worker-*.json"
@@ -126,7 +127,6 @@ def worker_main(supervisor_pid: int) -> None:
 
     from armscan.sweeps.workers.heartbeat import Heartbeat
     from armscan.sweeps.workers.worker import work
-    from armscan.utils.log import log
 
     make_heartbeat = partial(
         Heartbeat,
