@@ -170,7 +170,9 @@ def test_multirun_runs_its_jobs_as_children_and_a_failed_one_stops_no_other(tmp_
     runs = runs_in(tmp_path)[1]
     parents = [each for each in runs if each.info.run_name.startswith("grid")]
     assert len(runs) == len(parents) + 2 == 4
-    new_parent = next(each for each in parents if each.info.run_id != parent.info.run_id)
+    (old_parent,) = [each for each in parents if each.info.run_id == parent.info.run_id]
+    (new_parent,) = [each for each in parents if each is not old_parent]
+    assert old_parent.data.tags["continued_by"] == new_parent.info.run_id
     adopted = [each.data.tags["mlflow.parentRunId"] for each in runs if each not in parents]
     assert adopted == [new_parent.info.run_id] * 2
     for child in children:

@@ -33,7 +33,7 @@ from armscan.experiment.job import (
 from armscan.launch.launchers import LAUNCHER, check_launcher, prepare_launcher
 from armscan.tracking import TrackingStore, begin_outbox, code_state, note_end, open_store, sync
 from armscan.tracking.sync import PROCESS_DIED
-from armscan.tracking.tags import FAILURE_TAG, FOLDER_TAG, GRID_TAG, JOB_TAG
+from armscan.tracking.tags import CONTINUED_TAG, FAILURE_TAG, FOLDER_TAG, GRID_TAG, JOB_TAG
 from armscan.utils.run_files import LAST_CHECKPOINT, RESULTS_PAGE
 
 if TYPE_CHECKING:
@@ -103,6 +103,8 @@ class Multirun(Callback):
             GRID_TAG: json.dumps(again),
         }
         run = client.create_run(experiment_id, name=f"grid {command}"[:250], tags=tags)
+        if Multirun.repeats is not None:
+            client.set_tag(Multirun.repeats, CONTINUED_TAG, run.info.run_id)
         parent = {"run_id": run.info.run_id, "tracking": tracking, "overrides": overrides, "common": _common(overrides)}
         parent |= {"repeats": Multirun.repeats, "is_trusted": Multirun.is_trusted}
         # Also if it was resumed with --trust.

@@ -24,6 +24,8 @@ FAILURE_TAG = "failure"
 JOB_TAG, GRID_TAG = "job", "grid"
 # Of a grid's run: the run of its best job, whose figures it shows.
 BEST_TAG = "best.run"
+# Of a grid's run: the run of the later grid that has taken over its jobs.
+CONTINUED_TAG = "continued_by"
 # Of a study's runs: its name and storage, the number of the trial, and whether the trial was pruned.
 STUDY_TAG, STORAGE_TAG, TRIAL_TAG, PRUNED_TAG = "study", "study.storage", "trial", "pruned"
 # Prefix of metrics that a study measures to select a configuration; no other run has them.

@@ -107,3 +107,15 @@ def test_network_and_memory_without_effect_are_refused(override):
     for agent in ("plane_finder", "residual_sac"):
         with pytest.raises(InvalidValueError, match="memory is 2, but a plane finder takes no best actions"):
             check_effects(compose([f"agent={agent}", "memory=2"]), [])
+
+
+@pytest.mark.parametrize("part", ["validation", "test"])
+def test_number_of_phantoms_beside_volumes_of_the_folder_is_refused(part):
+    override = f"data.n_{part}=3"
+    mixed = ["data=mixed", "data.path=wrists", override]
+    with pytest.raises(
+        InvalidValueError, match=f"'{override}' has no effect: the {part} volumes are those of data.path"
+    ):
+        check_effects(compose(mixed), [*mixed])
+    check_effects(compose([*mixed, f"data.{part}=phantoms"]), [*mixed])
+    check_effects(compose([override]), [override])
