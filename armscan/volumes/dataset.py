@@ -40,9 +40,9 @@ class Dataset:
     Args:
         volumes: Volumes by file name, without the excluded ones.
         reports: Summary of each file, and of the volume made from it, by file name.
-        splits: Split of each volume (`train`, `validation` or `test`), by file name; None if the manifest has no
+        splits: Split of each volume (`train`, `validation` or `test`), by file name. Default: None, the manifest has no
             splits.
-        excluded: Reason why a volume of the folder was left out, by file name.
+        excluded: Reason why a volume of the folder was left out, by file name. Default: none.
         manifest: Manifest that the volumes were read with. Default: None, unknown.
     """
 
@@ -75,7 +75,7 @@ def open_dataset(path: str | Path, *, require_manifest: bool = True) -> Dataset:
         path: Folder of the volumes. `docs/manifest.md` describes its manifest: `manifest.yaml`, `manifest.yml` or
             `manifest.json`. `optimal_actions.json`, an object with the volumes' entries only, is read too.
         require_manifest: Whether to refuse a folder without a manifest, instead of reading it as if its manifest were
-            empty.
+            empty. Default: True.
 
     Returns:
         The volumes in the order of their names, and their metadata.
@@ -164,8 +164,8 @@ def _manifest_of(path: str | Path, *, require_manifest: bool) -> tuple[Path | No
 
 
 def copies_among(volumes: Mapping[Key, LabelVolume]) -> Iterator[tuple[Key, Key]]:
-    """Yield the keys of every two volumes with the same voxels; their labelled planes may differ."""
-    # To compare every pair of volumes would take long: copies also have the same spacing and sample of voxels.
+    """Yield the keys of each pair of volumes with the same voxels; their labelled planes may differ."""
+    # Only volumes with the same spacing and the same sample of voxels are compared in full.
     seen: dict[Hashable, list[Key]] = {}
     for key, volume in volumes.items():
         similar = seen.setdefault((volume.shape, volume.spacing, volume.labels_yxz[::16].tobytes()), [])

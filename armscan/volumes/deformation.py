@@ -19,7 +19,7 @@ class DeformingTransform(RigidTransform):
 
     D maps the plane onto itself. In the plane's frame (across, along its normal, in depth), with `about_mm` as the
     origin, F = `deformation` moves the volume's point x to F x, so that a lookup at x reads F^-1 x. `inverse_plane`
-    holds for this plane; for any other it ignores the deformation.
+    is exact for this plane; for any other it ignores the deformation.
 
     Args:
         plane: Plane that the deformation keeps.
@@ -41,8 +41,8 @@ class DeformingTransform(RigidTransform):
         is_map = matrix.shape == (3, 3) and bool(np.isfinite(matrix).all())
         if not is_map or matrix[1, [0, 2]].any() or np.linalg.det(matrix) == 0.0:
             raise InvalidValueError(
-                f"deformation is {matrix.tolist()}, but it must be 3 x 3, not flat, with zeros beside the middle of "
-                "its second row"
+                f"deformation is {matrix.tolist()}, but it must be finite, 3 x 3 and invertible, with a "
+                "second row of (0, s, 0)"
             )
 
     @cached_property

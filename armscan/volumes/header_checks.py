@@ -38,7 +38,7 @@ NRRD_TYPES |= {"long long int": 8, "ulonglong": 8, "int64": 8, "uint64": 8, "flo
 OTHER_LENGTHS = {f"{prefix}{unit}" for prefix in ("", "centi", "micro", "nano") for unit in ("meter", "metre")}
 OTHER_LENGTHS |= {f"{name}s" for name in OTHER_LENGTHS} | {"m", "cm", "um", "\u00b5m", "\u03bcm", "nm"}
 OTHER_LENGTHS |= {"micron", "microns", "in", "inch", "inches"}
-# Spaces of NRRD that are not the patient's; SimpleITK reads them as left-posterior-superior.
+# NRRD spaces that are not anatomical; SimpleITK reads them as left-posterior-superior.
 NO_ANATOMY = ("scanner-xyz", "sxyz", "3d-right-handed", "3dr", "3d-left-handed", "3dl")
 # Those that 3D Slicer writes, and slicerio reads.
 SEGMENTATION_SPACES = ("left-posterior-superior", "right-anterior-superior")
@@ -46,7 +46,15 @@ NRRD_ENCODINGS = {"raw": None, "gzip": GZIP, "gz": GZIP}
 
 
 def check_nrrd(path: Path, needed: Sequence[str] = ()) -> None:
-    """Raise `VolumeError` if an NRRD file is damaged, lacks a field, or gives no finite and positive spacing."""
+    """Check an NRRD file.
+
+    Args:
+        path: File to check.
+        needed: Fields that it must have beside type, dimension, sizes and encoding. Default: none.
+
+    Raises:
+        VolumeError: If it is damaged, lacks a field, or gives no finite and positive spacing.
+    """
     header, end, _ = _text_header(path).partition(b"\n\n")
     if b"\r\n" in header or not end:
         header, end, _ = _text_header(path).partition(b"\r\n\r\n")
@@ -55,7 +63,7 @@ def check_nrrd(path: Path, needed: Sequence[str] = ()) -> None:
     if (space := fields.get("space", "").lower()) in NO_ANATOMY:
         raise VolumeError(
             f"{path}: space is {space}, which does not say where left, posterior and superior are; it must be "
-            "left-posterior-superior or another anatomical space, or not there"
+            "left-posterior-superior or another anatomical space, or absent"
         )
     for name in ("space units", "units"):
         _check_units(path, name, re.findall(r'"([^"]*)"', fields.get(name, "")))
@@ -116,7 +124,7 @@ def check_metaimage(path: Path) -> None:
     file = path if is_local else _beside(path, fields["ElementDataFile"])
     offset = len(header) if is_local else 0
     if fields.get("HeaderSize", "0") != "0":
-        raise VolumeError(f"{path}: HeaderSize is {fields['HeaderSize']}, but it must be 0 or not there")
+        raise VolumeError(f"{path}: HeaderSize is {fields['HeaderSize']}, but it must be 0 or absent")
     n_compressed = str(file.stat().st_size - offset)
     # Without it, SimpleITK cannot read compressed voxels that follow their header.
     n_promised = fields.get("CompressedDataSize", "no number" if is_local else n_compressed)
@@ -126,7 +134,7 @@ def check_metaimage(path: Path) -> None:
             f"header promises {n_promised}"
         )
     if (n_values := fields.get("ElementNumberOfChannels", "1")) != "1":
-        raise VolumeError(f"{path}: ElementNumberOfChannels is {n_values}, but a labelmap has one value in each voxel")
+        raise VolumeError(f"{path}: ElementNumberOfChannels is {n_values}, but a labelmap has one value per voxel")
     stored = StoredVoxels(
         file,
         count_voxels(path, sizes) * METAIMAGE_TYPES[kind],
@@ -188,18 +196,16 @@ def _check_finite(path: Path, name: str, fields: Mapping[str, str], words: Seque
 
 
 def _beside(path: Path, name: str) -> Path:
-    """Return the one file of voxels that a header names."""
+    """Return the file of voxels that a header names; raise `VolumeError` if there is none of that name."""
     file = path.parent / name.replace("\0", "")
     if not file.is_file():
-        raise VolumeError(
-            f"{path}: its voxels are in {name!r}, but they must be in one file, and there is none of that name"
-        )
+        raise VolumeError(f"{path}: its voxels are in {name!r}, but there is no such file; they must be in one file")
     return file
 
 
 def _no_labelmap(path: Path, dimension: str, sizes: list[int], kind: str) -> str:
     received = f"{dimension} dimensions of {', '.join(map(str, sizes))} voxels of type {kind}"
-    return f"{path}: has {received}, but a labelmap has 3, each of a size, and integers or floats"
+    return f"{path}: has {received}, but a labelmap has 3, a size for each, and integers or floats"
 
 
 def _is_true(path: Path, fields: dict[str, str], name: str, *, default: bool) -> bool:

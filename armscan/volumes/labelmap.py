@@ -21,7 +21,7 @@ TISSUE_LABELS = {name: label for label, name in LABEL_NAMES.items()}
 BACKGROUND = TISSUE_LABELS["background"]
 # Tissues that every labelmap must have.
 LANDMARKS = ("bones", "tendons", "artery")
-# A range of values below this gets a dense lookup table; a wider one is sorted and searched.
+# A narrower range of values is looked up in a dense table, a wider one by binary search.
 MAX_TABLE = 65536
 LARGEST_INT64 = 2**63 - 1
 # Integers up to this are exact in a 64-bit float.
@@ -43,9 +43,9 @@ class LabelMap:
         bones: Values and segment names of the bones, in a list or tuple.
         tendons: Values and segment names of the flexor tendons.
         artery: Values and segment names of the ulnar artery.
-        nerve: Values and segment names of the median nerve.
-        background: Values and segment names to ignore.
-        others: `background` maps every other value to background; None refuses a file with other values.
+        nerve: Values and segment names of the median nerve. Default: none.
+        background: Values and segment names to ignore. Default: none.
+        others: `background` maps every other value to background. Default: None, a file with other values is refused.
 
     Raises:
         InvalidValueError: If a source is neither a whole number nor a string, or is listed twice, or a landmark (bones,
@@ -133,8 +133,8 @@ def map_values(
     if unnamed := [value for value, label in table.items() if label is None]:
         if labels is None:
             raise VolumeError(
-                f"{where}: holds the values {shown(counts)}, but {ALLOWED_LABELS} only; if it is no image, say what "
-                "they are in the folder's manifest.yaml: labels: {bones: [...], tendons: [...], artery: [...]}"
+                f"{where}: holds the values {shown(counts)}, but {ALLOWED_LABELS} only; if it is no image, map "
+                "them to tissues in the folder's manifest.yaml: labels: {bones: [...], tendons: [...], artery: [...]}"
             )
         is_quoted = any(str(value) in labels.by_source for value in unnamed)
         hint = " (a number in quotes is the name of a segment)" if is_quoted else ""

@@ -59,7 +59,7 @@ def volume_files(folder: Path) -> dict[str, Path]:
 
 def find_manifest(folder: Path) -> Path | None:
     """Return the one manifest of a folder, None if there is none; refuse a link that leads nowhere."""
-    # Such a link counts: to write a new manifest through it would make any file of this user.
+    # A dangling link counts, too: writing a new manifest through it could create a file anywhere.
     found = [folder / name for name in MANIFEST_NAMES if os.path.lexists(folder / name)]
     if len(found) > 1:
         raise ManifestError(f"{folder}: holds {' and '.join(path.name for path in found)}, but one manifest is allowed")
@@ -69,7 +69,7 @@ def find_manifest(folder: Path) -> Path | None:
 
 
 def read_manifest(path: Path) -> Manifest:
-    """Read and check a manifest; an error names the file, the entry, the key, the value and what is allowed."""
+    """Read and check a manifest; errors name the file, the entry, the key, the value and the allowed values."""
     # Deferred: phantoms have no manifest.
     from armscan.volumes.manifest_schema import check_manifest
 
@@ -101,9 +101,10 @@ def record_planes(
 
     Args:
         folder: Folder of the volumes.
-        planes: Labelled plane and its reward, by file name; the plane is in the frame of the volume that `open_dataset`
-            returns.
-        read_with: Manifest that these volumes were read with. Default: None, today's.
+        planes: Labelled plane and its reward in [-1, 0], by file name; the plane is in the frame of the volume that
+            `open_dataset` returns.
+        read_with: Manifest that these volumes were read with, for an error if their settings have changed since.
+            Default: None, no such check.
 
     Returns:
         The manifest.
@@ -125,7 +126,7 @@ def record_planes(
 
 def _locked(folder: Path) -> AcquireReturnProxy:
     """Lock a folder, and return the context that releases it: concurrent writers would overwrite each other."""
-    # It lies elsewhere, so that none is left in the folder, and other users of a shared cache may lock it, too.
+    # The lock lies in the cache, so that none is left in the folder; other users of a shared cache may lock it, too.
     path = cache_folder() / f"manifest-{sha256(os.fsencode(folder.resolve()))[:16]}.lock"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -150,7 +151,7 @@ def _recorded(
     if read_with is not None:
         changed = [name for name in recorded if _reading_of(manifest, name) != _reading_of(read_with, name)]
         if changed:
-            raise ManifestError(f"{path}: its settings for {few(changed)} have changed since; look for the plane again")
+            raise ManifestError(f"{path}: its settings for {few(changed)} have changed since; search the plane again")
     entries = document.get("volumes")
     entries = {name: {} for name in files} if entries is None else entries
     entries = {**entries, **{name: {**entries.get(name, {}), **keys} for name, keys in recorded.items()}}
@@ -184,7 +185,7 @@ def _edited(text: str, recorded: dict[str, Document], wanted: Document) -> str:
     entries = document["volumes"]
     for name, keys in recorded.items():
         entry = entries.get(name, {})
-        # Other entries may repeat one with an anchor: those stay as they are.
+        # Other entries may be aliases of one with an anchor: they stay as they are.
         has_anchor = isinstance(entry, CommentedMap) and entry.anchor.value is not None
         entries[name] = entry.copy() if has_anchor else entry
         entries[name].update(keys)

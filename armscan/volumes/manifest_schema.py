@@ -153,7 +153,7 @@ def check_manifest(document: dict[str, Any], path: Path) -> Manifest:
 
 
 def _in_one_line(error: ValidationError, path: Path) -> str:
-    """Describe the first mistake: the file, the entry, the key, the value received and what is allowed."""
+    """Describe the first mistake: the file, the entry, the key, the value received and the allowed values."""
     mistake = error.errors(include_url=False)[0]
     kind, received, place = mistake["type"], reprlib.repr(mistake["input"]), list(mistake["loc"])
     model: type[BaseModel] = Manifest

@@ -39,7 +39,7 @@ MAX_WAITED_S = 60.0
 UNFINISHED_FOR_S = 3600.0
 
 Made = tuple[LabelVolume, Any]
-"""A volume, and data to keep with it, of JSON's types."""
+"""A volume, and JSON-serialisable data to keep with it."""
 
 
 def mapped_volume(path: Path, make: Callable[[], Made]) -> Made:
@@ -128,7 +128,7 @@ def _next_page(n_bytes: int) -> int:
 
 
 def _make_room(kept: Path) -> None:
-    """Evict the least recently opened files until the folder is within its limit, and killed processes' leftovers."""
+    """Remove what killed processes left; evict the least recently opened files until the folder is within its limit."""
     limit = limit_bytes()
     for unfinished in kept.parent.glob(f".*{OF_VOLUMES}.*.{UNFINISHED}"):
         with contextlib.suppress(OSError):

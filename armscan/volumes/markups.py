@@ -55,7 +55,7 @@ def write_markup(path: str | Path, volume: LabelVolume, action: ManipulatorActio
             f"volume and action are {volume!r} and {action!r}, but they must be a LabelVolume and a ManipulatorAction"
         )
     if not path.name.endswith(MARKUP_SUFFIX):
-        raise MarkupError(f"{path}: a markups file must end in {MARKUP_SUFFIX}, or Slicer does not know it as one")
+        raise MarkupError(f"{path}: a markups file must end in {MARKUP_SUFFIX}, or Slicer does not recognise it")
     document = {"@schema": SCHEMA, "markups": [_markup(volume, action)]}
     try:
         atomic_write(path, json.dumps(document, indent=2) + "\n")
@@ -79,7 +79,7 @@ def read_markup(path: str | Path, volume: LabelVolume) -> ManipulatorAction:
 
     Raises:
         InvalidValueError: If an argument has the wrong type.
-        MarkupError: Naming the file and the key, if the file does not define a plane, or no action describes it.
+        MarkupError: If the file does not define a plane, or no action describes it.
     """
     path = check_path("the markups file", path)
     if not isinstance(volume, LabelVolume):
@@ -93,7 +93,7 @@ def read_markup(path: str | Path, volume: LabelVolume) -> ManipulatorAction:
     rz = np.arctan2(-normal[0], normal[1])
     turned = ManipulatorAction((float(np.rad2deg(rz)), float(np.rad2deg(rx))), (0.0, 0.0))
     across, in_depth = turned.matrix[:, 0], turned.matrix[:, 2]
-    where = f"{path}: the plane by center and normal, or controlPoints and baseToNode, lies"
+    where = f"{path}: the plane given by center and normal, or by controlPoints and baseToNode, lies"
     if in_depth[2] < MIN_SLOPE:
         raise MarkupError(f"{where} along the palm of {volume.name}, but it must cross the arm")
     slice_origin_mm = point_mm - turned.matrix @ _slice_centre(volume)

@@ -18,39 +18,39 @@ from armscan.volumes.stored_voxels import GZIP, StoredVoxels, check_spacing, che
 
 # Voxel types by their code; the header's own `bitpix` may be anything, and is ignored when voxels are read.
 TYPES = {2: "u1", 4: "i2", 8: "i4", 16: "f4", 64: "f8", 256: "i1", 512: "u2", 768: "u4", 1024: "i8", 1280: "u8"}
-# By the header's size, NIfTI-1 or NIfTI-2: the `struct` format and the offset of each field.
+# By the header's size, NIfTI-1 or NIfTI-2: the `struct` format and the offset of each field, or of fields in a row.
 LAYOUTS = {
     348: {
         "magic": ("4s", 344),
-        "dimensions": ("8h", 40),
-        "type": ("h", 70),
-        "steps": ("8f", 76),
-        "begin": ("f", 108),
-        "codes": ("2h", 252),
-        "place": ("18f", 256),
+        "dim": ("8h", 40),
+        "datatype": ("h", 70),
+        "pixdim": ("8f", 76),
+        "vox_offset": ("f", 108),
+        "form_codes": ("2h", 252),
+        "forms": ("18f", 256),
     },
     540: {
         "magic": ("8s", 4),
-        "dimensions": ("8q", 16),
-        "type": ("h", 12),
-        "steps": ("8d", 104),
-        "begin": ("q", 168),
-        "codes": ("2i", 344),
-        "place": ("18d", 352),
+        "dim": ("8q", 16),
+        "datatype": ("h", 12),
+        "pixdim": ("8d", 104),
+        "vox_offset": ("q", 168),
+        "form_codes": ("2i", 344),
+        "forms": ("18d", 352),
     },
 }
 MAGIC = (b"n+1\0", b"n+2\0\r\n\032\n")
 LONGEST_HEADER = 544
 # No header is longer, extensions included.
 MAX_OFFSET = 1 << 24
-# Between the spacings of the header and of the sform, both of which many programs round.
+# Relative, between the spacings of pixdim and of the sform, both of which many programs round.
 SPACING_TOLERANCE = 1e-3
-# Between qform and sform: the cosines of the axes, and the origin in units of the smallest spacing.
+# Between the forms (qform and sform): the cosines of the axes, and the origin in units of the smallest spacing.
 COSINE_TOLERANCE, ORIGIN_TOLERANCE = 0.01, 0.1
 
 
 def check_nifti(path: Path) -> None:
-    """Raise `VolumeError` if a NIfTI file is damaged or states two spacings, or a place or voxel is not finite."""
+    """Raise `VolumeError` if a NIfTI file is damaged, contradicts itself, or has a form or voxel that is not finite."""
     compression = GZIP if path.suffix == ".gz" else None
     header = b""
     with path.open("rb") as file:
@@ -64,68 +64,68 @@ def check_nifti(path: Path) -> None:
     if not 0 < size <= len(header) - 4:
         raise VolumeError(f"{path}: the file does not begin with a NIfTI header")
     fields = {name: struct.unpack_from(order + code, header, at) for name, (code, at) in LAYOUTS[size].items()}
-    (magic,), (n_dimensions, *sizes), (begin,), (code,) = (
-        fields[name] for name in ("magic", "dimensions", "begin", "type")
+    (magic,), (n_dimensions, *sizes), (vox_offset,), (datatype,) = (
+        fields[name] for name in ("magic", "dim", "vox_offset", "datatype")
     )
     if magic not in MAGIC:
-        raise VolumeError(f"{path}: the header is damaged, or of a pair of files (.hdr and .img), which is not read")
+        raise VolumeError(f"{path}: the header is damaged, or of a pair of files (.hdr and .img), which cannot be read")
     # The four bytes after a header say whether extensions follow.
-    if not size + 4 <= begin < MAX_OFFSET or begin != int(begin):
-        raise VolumeError(f"{path}: the header ends at byte {size + 4}, but its voxels begin at byte {begin:g}")
-    if not 1 <= n_dimensions <= 7 or code not in TYPES:
+    if not size + 4 <= vox_offset < MAX_OFFSET or vox_offset != int(vox_offset):
+        raise VolumeError(f"{path}: the header ends at byte {size + 4}, but its voxels begin at byte {vox_offset:g}")
+    if not 1 <= n_dimensions <= 7 or datatype not in TYPES:
         raise VolumeError(
-            f"{path}: has {n_dimensions} dimensions and voxels of type {code}, but a labelmap has 3, and integers or "
-            "floats"
+            f"{path}: has {n_dimensions} dimensions and voxels of type {datatype}, but a labelmap has 3, and integers "
+            "or floats"
         )
     # The spacings of unused axes are often 0 and mean nothing.
-    check_spacing(path, fields["steps"][1:4][:n_dimensions])
-    if not all(map(math.isfinite, fields["place"])):
-        raise VolumeError(f"{path}: its place in the world (qform, sform) holds a NaN or an infinity")
-    of_qform, of_sform = (code > 0 for code in fields["codes"])
+    check_spacing(path, fields["pixdim"][1:4][:n_dimensions])
+    if not all(map(math.isfinite, fields["forms"])):
+        raise VolumeError(f"{path}: its qform or sform holds a NaN or an infinity")
+    of_qform, of_sform = (code > 0 for code in fields["form_codes"])
     if of_sform:
-        _check_one_spacing(path, fields["steps"][1:4][:n_dimensions], fields["place"][6:])
+        _check_spacings_agree(path, fields["pixdim"][1:4][:n_dimensions], fields["forms"][6:])
     if of_qform and of_sform and n_dimensions >= 3:
-        _check_one_place(path, fields["steps"][:4], fields["place"])
-    voxel = np.dtype(order + TYPES[code])
+        _check_forms_agree(path, fields["pixdim"][:4], fields["forms"])
+    voxel = np.dtype(order + TYPES[datatype])
     check_stored(
         path,
         StoredVoxels(
             path,
-            int(begin) + count_voxels(path, sizes[:n_dimensions]) * voxel.itemsize,
+            int(vox_offset) + count_voxels(path, sizes[:n_dimensions]) * voxel.itemsize,
             compression=compression,
-            n_before=int(begin),
+            n_before=int(vox_offset),
             finite=voxel.str if voxel.kind == "f" else None,
         ),
     )
 
 
-def _check_one_spacing(path: Path, steps: Sequence[float], sform: Sequence[float]) -> None:
-    """Raise `VolumeError` if the sform has another spacing than the header, by which SimpleITK goes."""
-    norms = np.linalg.norm(np.reshape(sform, (3, 4))[:, : len(steps)], axis=0)
-    if not np.allclose(norms, steps, rtol=SPACING_TOLERANCE, atol=0.0):
-        stated, other = (", ".join(f"{step:g}" for step in each) for each in (steps, norms))
+def _check_spacings_agree(path: Path, spacing: Sequence[float], sform: Sequence[float]) -> None:
+    """Raise `VolumeError` if the sform has another spacing than pixdim, which SimpleITK uses."""
+    norms = np.linalg.norm(np.reshape(sform, (3, 4))[:, : len(spacing)], axis=0)
+    if not np.allclose(norms, spacing, rtol=SPACING_TOLERANCE, atol=0.0):
+        stated, other = (", ".join(f"{step:g}" for step in each) for each in (spacing, norms))
         raise VolumeError(
             f"{path}: the spacing is ({stated}) by pixdim, but ({other}) by the sform: correct one of them"
         )
 
 
-def _check_one_place(path: Path, steps: Sequence[float], place: Sequence[float]) -> None:
-    """Raise `VolumeError` if qform and sform differ, of which SimpleITK takes one or the other.
+def _check_forms_agree(path: Path, pixdim: Sequence[float], forms: Sequence[float]) -> None:
+    """Raise `VolumeError` if qform and sform differ: SimpleITK uses only one of them.
 
     Args:
         path: The file.
-        steps: The sign of the qform's third axis, then the spacing.
-        place: Quaternion (b, c, d) and offset of the qform, then the rows of the sform.
+        pixdim: Sign of the qform's third axis, then the spacing.
+        forms: Quaternion (b, c, d) and offset of the qform, then the rows of the sform.
     """
     # Deferred: phantoms, and volumes in the cache, need no scipy.
     from scipy.spatial.transform import Rotation
 
-    b, c, d, *offset = place[:6]
+    b, c, d, *offset = forms[:6]
     turned = Rotation.from_quat([b, c, d, math.sqrt(max(0.0, 1.0 - b * b - c * c - d * d))]).as_matrix()
-    turned[:, 2] *= -1.0 if steps[0] < 0.0 else 1.0
-    sform = np.reshape(place[6:], (3, 4))
+    turned[:, 2] *= -1.0 if pixdim[0] < 0.0 else 1.0
+    sform = np.reshape(forms[6:], (3, 4))
     cosines = sform[:, :3] / np.linalg.norm(sform[:, :3], axis=0)
-    moved = np.linalg.norm(sform[:, 3] - offset) / min(steps[1:])
+    moved = np.linalg.norm(sform[:, 3] - offset) / min(pixdim[1:])
     if np.abs(cosines - turned).max() > COSINE_TOLERANCE or moved > ORIGIN_TOLERANCE:
         origins = (", ".join(f"{number:g}" for number in each) for each in (offset, sform[:, 3]))
         raise VolumeError(

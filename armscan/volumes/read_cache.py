@@ -73,14 +73,14 @@ def read_cached(
             raise VolumeError(f"{path}: has changed while it was read")
         return made, details.dump_python(stored, mode="json")
 
-    found, stored = cached_volume(_place("labelmap", path.name, digest, options, optimal_action), make)
+    found, stored = cached_volume(_cached_path("labelmap", path.name, digest, options, optimal_action), make)
     return found, details.validate_python(stored)
 
 
 def resample_cached(labelled: LabelVolume, spacing: Spacing) -> LabelVolume:
     """Resample a volume as `resample` does, or find it in the cache."""
     world_frame = labelled.origin, labelled.direction.tolist()
-    path = _place("resampled", labelled.name, labelled.fingerprint, world_frame, spacing)
+    path = _cached_path("resampled", labelled.name, labelled.fingerprint, world_frame, spacing)
     return cached_volume(path, lambda: (resample(labelled, spacing), None))[0]
 
 
@@ -98,7 +98,7 @@ def _digest(path: Path) -> str | None:
         return None
 
 
-def _place(kind: str, *depends_on: Any) -> Path:
+def _cached_path(kind: str, *depends_on: Any) -> Path:
     key = sha256(repr((_code_version(), depends_on)).encode())
     return cache_folder() / f"{kind}-{key}{SUFFIX}"
 

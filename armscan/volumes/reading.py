@@ -64,24 +64,25 @@ def read_volume(
 
     Args:
         path: File to read.
-        name: Name of the volume. None: the file's name.
-        optimal_action: Labelled plane, in the frame of the volume as returned.
-        labels: Mapping from values or segments to tissues. None: values are the labels of `LabelVolume`, and segments
-            are named bones, tendons, artery, nerve or background.
-        orientation: Orientation to bring the image into first, such as 'LPS'. None: as in the file.
+        name: Name of the volume. Default: None, the file's name.
+        optimal_action: Labelled plane, in the frame of the volume as returned. Default: None, no plane.
+        labels: Mapping from values or segments to tissues. Default: None, values are the labels of `LabelVolume`, and
+            segments are named bones, tendons, artery, nerve or background.
+        orientation: Orientation to bring the image into first, such as 'LPS'. Default: None, as in the file.
         axes: Axes of the arm that the image's first, second and third axis then run along: X across the palm, Y along
             the arm, Z through the depth. Default: 'xyz'.
         crop_mm: Part of the volume to keep, cropped last: a range in mm from the first voxel's centre, for any of the
             axes x, y and z. Voxels whose centres lie in it are kept; the first of them becomes the frame's origin.
+            Default: None, all of it.
         overlap: Rule for voxels in segments of different tissues: `refuse` raises, `first` and `last` take the tissue
-            of the first or last segment in the file.
+            of the first or last segment in the file. Default: `refuse`.
 
     Returns:
         The volume, its array indexed [x, y, z].
 
     Raises:
-        VolumeError: Naming the file, if it is missing, damaged, truncated, not a 3-D scalar image, not a labelmap, or
-            has a spacing that is not finite and positive; or if an argument is not as above.
+        VolumeError: If the file is missing, damaged, truncated, not a 3-D scalar image, not a labelmap, or has a
+            spacing that is not finite and positive; or if an argument is not as above.
     """
     path = check_path("the volume's file", path)
     try:
@@ -181,7 +182,7 @@ def _image(labels: NDArray[np.uint8], matrix: FloatArray, path: Path) -> SimpleI
 
     spacing = np.linalg.norm(matrix[:3, :3], axis=0)
     if not np.isfinite(matrix).all() or not (spacing > 0).all():
-        raise VolumeError(f"{path}: the place in the world is {matrix.tolist()}, but it must be finite, its axes not 0")
+        raise VolumeError(f"{path}: the matrix to the world is {matrix.tolist()}, but it must be finite, no axis 0")
     image = SimpleITK.GetImageFromArray(np.ascontiguousarray(labels.transpose(2, 1, 0)))
     image.SetSpacing(spacing.tolist())
     image.SetOrigin(matrix[:3, 3].tolist())

@@ -51,12 +51,12 @@ class RigidTransform:
     """A rigid motion T(q) = R (q - c) + c + t of the volume's frame; the moved volume is V'(q) = V(T(q)).
 
     Args:
-        rotation: Angles (rz, rx) in degrees; R = Rz(rz) Rx(rx).
-        translation: Offsets t = (tx, ty) in mm; the depth does not change.
-        centre_mm: Fixed point c of the rotation, in mm.
+        rotation: Angles (rz, rx) in degrees; R = Rz(rz) Rx(rx). Default: zeros.
+        translation: Offsets t = (tx, ty) in mm, within +-1e6; the depth does not change. Default: zeros.
+        centre_mm: Fixed point c of the rotation, in mm, within +-1e6. Default: zeros.
 
     Raises:
-        InvalidValueError: If a component is not a finite number, or one in mm is beyond 1e6.
+        InvalidValueError: If a component is not a finite number, or out of its range.
     """
 
     rotation: tuple[float, float] = (0.0, 0.0)

@@ -47,8 +47,8 @@ def read_segmentation(
         superior) in mm, and the segments found.
 
     Raises:
-        VolumeError: Naming the file, if it is damaged, a segment is not mapped, voxels belong to no segment, or
-            segments of different tissues overlap and `overlap` is `refuse`.
+        VolumeError: If the file is damaged, a segment is not mapped, voxels belong to no segment, or segments of
+            different tissues overlap and `overlap` is `refuse`.
     """
     contents = _contents(path)
     layers = contents["voxels"]
@@ -64,7 +64,7 @@ def read_segmentation(
     _check_strays(segments, counts, labels, path)
     found = tuple(FoundSource(each.name, each.label, counts[each.layer].get(each.value, 0)) for each in segments)
     if len(layers) == 1:
-        # A value that does not occur may be none that the voxels can have.
+        # A value that does not occur may not fit the voxels' data type.
         table = dict.fromkeys(counts[0], BACKGROUND)
         table |= {each.value: each.label for each in segments if each.value in table}
         return apply_table(layers[0], table), contents["ijkToLPS"], found

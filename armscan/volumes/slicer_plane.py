@@ -54,8 +54,8 @@ def read_slicer_plane(path: Path) -> SlicerPlane:
     """Read the one plane of a markups file.
 
     Raises:
-        MarkupError: Naming the file and the key, if the file cannot be read, holds no plane or several, is in units
-            other than mm, or does not define where the plane lies, or defines it twice and differently.
+        MarkupError: If the file cannot be read, holds no plane or several, is in units other than mm, does not define
+            where the plane lies, or defines it in two ways that disagree.
     """
     markup = _only_plane(_load(path), path)
     system, units = markup.get("coordinateSystem", "LPS"), markup.get("coordinateUnits", "mm")
@@ -89,7 +89,7 @@ def _only_plane(document: Any, path: Path) -> dict[str, Any]:
     planes: list[dict[str, Any]] = [markup for markup in markups if markup.get("type") == "Plane"]
     if len(planes) != 1:
         types = [markup.get("type") for markup in markups]
-        raise _error(path, "the type of the markups", types, "'Plane' of exactly one of them")
+        raise _error(path, "the type of the markups", types, "'Plane' for exactly one of them")
     return planes[0]
 
 
@@ -124,7 +124,7 @@ def _agreed(shown: Plane | None, stated: Plane | None, path: Path) -> Plane:
         only = shown or stated
         if only is None:
             raise MarkupError(
-                f"{path}: has too few of controlPoints for its planeType, or no baseToNode, and no center and normal"
+                f"{path}: has too few controlPoints for its planeType, or no baseToNode, and no center and normal"
             )
         return only
     offset_mm = abs(float(shown[1] @ (stated[0] - shown[0])))
@@ -169,7 +169,7 @@ def _numbers(markup: dict[str, Any], key: str, length: int, path: Path) -> Float
 def _unit(direction: FloatArray, key: str, path: Path) -> FloatArray:
     length = float(np.linalg.norm(direction))
     if length < 1e-6:
-        raise _error(path, key, direction.tolist(), "a direction, but not zero")
+        raise _error(path, key, direction.tolist(), "a direction other than zero")
     unit: FloatArray = direction / length
     return unit
 

@@ -81,7 +81,7 @@ def pieces(path: Path, file: BinaryIO, compression: int | None) -> Iterator[byte
     """Yield the rest of a file in chunks, inflated if it is compressed.
 
     Raises:
-        VolumeError: Naming the image `path`, if the compressed data is damaged or truncated.
+        VolumeError: If the compressed data is damaged or truncated; `path` is the image that the message names.
     """
     if compression is None:
         yield from iter(lambda: file.read(PIECE_BYTES), b"")

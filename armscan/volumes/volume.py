@@ -37,14 +37,14 @@ class LabelVolume:
             memory (`labels_yxz`).
         spacing: Voxel spacing (sx, sy, sz) in mm.
         name: Name of the volume in errors, `info` and tables.
-        optimal_action: Labelled plane, in the volume's own frame.
+        optimal_action: Labelled plane, in the volume's own frame. Default: None, not known.
         origin: World coordinates (LPS) of voxel (0, 0, 0), in mm. Default: zeros.
         direction: Direction cosines of the array's axes in the world, as columns, shape (3, 3). Default: the identity.
         subject: Name of the person, of whom there may be other volumes. Default: None, this volume is the only one.
 
     Raises:
-        VolumeError: Naming the volume, if the labels are not a 3-D array of the labels above, a landmark is missing,
-            the spacing is not within 1e-6 to 1e6 mm, `origin` is not a position, or `direction` is not orthonormal.
+        VolumeError: If the labels are not a 3-D array of the labels above, a landmark is missing, the spacing is not
+            within 1e-6 to 1e6 mm, `origin` is not a position, or `direction` is not orthonormal.
     """
 
     labels: NDArray[np.uint8]
@@ -180,8 +180,8 @@ class LabelVolume:
 
         Args:
             action: Plane to slice.
-            shape: Number of pixels (across, depth). None: (nx, nz).
-            transform: Motion T of the volume: the slice is taken from V'(q) = V(T(q)). None: no motion.
+            shape: Number of pixels (across, depth), each from 1 to 65,536. Default: None, (nx, nz).
+            transform: Motion T of the volume: the slice is taken from V'(q) = V(T(q)). Default: None, no motion.
 
         Returns:
             The slice, indexed [across, depth], uint8; 0 if the plane is outside the volume.

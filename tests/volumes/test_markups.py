@@ -249,7 +249,7 @@ def set_key(key, value):
         (set_key("planeType", "bent"), "planeType is 'bent', but it must be planeFit, pointNormal or threePoints"),
         (set_key("center", [0.0, float("nan"), 0.0]), r"center is \[0.0, nan, 0.0\], but it must be 3 finite numbers"),
         (set_key("center", [0.0, 1e9, 0.0]), r"center is .* within \+-1e\+06"),
-        (set_key("normal", [0, 0, 0]), r"normal is \[0.0, 0.0, 0.0\], but it must be a direction, but not zero"),
+        (set_key("normal", [0, 0, 0]), r"normal is \[0.0, 0.0, 0.0\], but it must be a direction other than zero"),
         (set_key("normal", [0, 0, 1]), "center and normal are .* degrees off the plane"),
         (set_key("baseToNode", [0] * 16), r"baseToNode is \[0.0, 0.0, 0.0\], but it must be a direction"),
         (set_key("baseToNode", [1, 2]), "baseToNode is .* 16 finite numbers"),
@@ -270,7 +270,7 @@ def test_markup_without_anything_that_says_where_the_plane_lies_is_refused(tmp_p
         for key in ("center", "controlPoints"):
             del markup[key]
 
-    with pytest.raises(MarkupError, match="too few of controlPoints"):
+    with pytest.raises(MarkupError, match="too few controlPoints"):
         read_markup(rewritten(tmp_path, change), TINY)
 
 

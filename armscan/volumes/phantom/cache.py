@@ -21,7 +21,16 @@ _IN_MEMORY: WeakValueDictionary[Path, LabelVolume] = WeakValueDictionary()
 
 
 def load_phantoms(seeds: Iterable[int], cache_dir: Path | None = None, version: int = 1) -> dict[str, LabelVolume]:
-    """Return the phantoms of the given seeds by name; see `load_phantom`."""
+    """Return phantoms by name; make and cache those that the cache lacks.
+
+    Args:
+        seeds: Seeds of the phantoms.
+        cache_dir: Folder of the cache; see `load_phantom`. Default: None.
+        version: Version of the anatomy; see `make_phantom`. Default: 1.
+
+    Raises:
+        InvalidValueError: As for `load_phantom`.
+    """
     wanted = list(seeds)
     with ThreadPoolExecutor() as threads:
         # Existing files are verified on all cores; `there` keeps their volumes alive until they are returned.
@@ -41,11 +50,14 @@ def load_phantom(seed: int, cache_dir: Path | None = None, version: int = 1) -> 
 
     Args:
         seed: Seed of everything drawn; see `make_phantom`.
-        cache_dir: Folder of the cache. None: `$ARMSCAN_CACHE`, or else the user's cache folder.
+        cache_dir: Folder of the cache. Default: None, `$ARMSCAN_CACHE` or else the user's cache folder.
         version: Version of the anatomy; see `make_phantom`. Default: 1.
 
     Returns:
         The same volume as `make_phantom(seed, version)`, its voxels in memory once for all processes.
+
+    Raises:
+        InvalidValueError: As for `make_phantom`, or if the folder cannot be written.
     """
     path = _path(seed, cache_dir, version)
     volume = _opened(path)
