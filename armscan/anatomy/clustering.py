@@ -20,8 +20,8 @@ def disc_half_widths(eps: float, row_step: float = 1.0, col_step: float = 1.0) -
 
     Args:
         eps: Radius, in the unit of the steps.
-        row_step: Distance of neighbouring rows.
-        col_step: Distance of neighbouring columns.
+        row_step: Distance between neighbouring rows. Default: 1.
+        col_step: Distance between neighbouring columns. Default: 1.
     """
     rows, columns = np.arange(int(eps / row_step) + 2), np.arange(int(eps / col_step) + 2)
     with np.errstate(over="ignore"):

@@ -66,8 +66,9 @@ class TissueClusters:
 
         Args:
             slice_xz: Integer labels of the slice, indexed [across, depth].
-            tissues: Clustering rules: `pixels`, `metric`, or an `armscan.anatomy.Tissues`.
-            pixel_mm: Pixel size (across, depth) in mm, for tissues that are clustered by millimetres.
+            tissues: Clustering rules: `pixels`, `metric`, or an `armscan.anatomy.Tissues`. Default: `pixels`.
+            pixel_mm: Pixel size (across, depth) in mm, for tissues that are clustered by millimetres. Default:
+                (0.27, 0.55).
 
         Raises:
             InvalidValueError: If the slice is not a 2-D array of integers, or `tissues` or `pixel_mm` is not as above.

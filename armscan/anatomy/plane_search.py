@@ -42,7 +42,7 @@ class FoundPlane:
         score: Reward of the plane, in [-1, 0].
         counts: Number of clusters of bones, tendons and artery in its slice.
         spread: Extent of the largest connected region of planes with the best score, end to end: (rz, rx) in degrees
-            and along the arm in mm; None for a plane of a person or an agent.
+            and along the arm in mm. Default: None, for a plane that a person or an agent chose.
         is_cut: Whether that region reaches the limit of rz or rx, beyond which it may go on. Default: False.
     """
 
@@ -102,7 +102,13 @@ class PlaneGrid:
 
 
 class PlaneScorer:
-    """Scores planes of one volume."""
+    """Scores planes of one volume.
+
+    Args:
+        volume: Volume of the planes.
+        reward: Reward that scores them.
+        tissues: Clustering rule of each tissue.
+    """
 
     def __init__(self, volume: LabelVolume, reward: Reward, tissues: Tissues) -> None:
         self.volume = volume
@@ -142,7 +148,7 @@ def find_optimal_plane(
             score. Default: 3.
         success_threshold: Threshold of success: a plane counts as found if it scores above -success_threshold. Default:
             0.05.
-        targets: Target counts of the reward. Default: (4, 3, 1).
+        targets: Target counts of the reward, each from 1 to 1000. Default: (4, 3, 1).
         clustering: Clustering rules: `pixels`, `metric`, or an `armscan.anatomy.Tissues`. Default: `pixels`.
 
     Returns:
@@ -150,7 +156,7 @@ def find_optimal_plane(
 
     Raises:
         InvalidValueError: If an argument is out of bounds, or more than a million planes would be tried.
-        OptimalPlaneError: Naming the volume and the best score, if no plane scores above -success_threshold.
+        OptimalPlaneError: If no plane scores above -success_threshold; the message names the best score.
     """
     if not isinstance(volume, LabelVolume):
         raise InvalidValueError(f"volume is {volume!r}, but it must be a LabelVolume")

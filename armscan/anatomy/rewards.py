@@ -42,8 +42,8 @@ class LandmarkReward:
     single artery in depth.
 
     Args:
-        targets: Target counts: clusters of bones, tendons and artery on a labelled plane; (7, 5, 1) in the
-            other published description. Default: (4, 3, 1).
+        targets: Target counts: clusters of bones, tendons and artery on a labelled plane, each from 1 to 1000;
+            (7, 5, 1) in the other published description. Default: (4, 3, 1).
 
     Raises:
         InvalidValueError: If `targets` is not three whole numbers from 1 to 1000.
@@ -72,13 +72,14 @@ class AgreementReward(LandmarkReward):
     The published reward can be 0 as far as 10 mm or 15 degrees from a labelled plane. The agreement rates seven
     features of a slice: the clustered area of each tissue, and how far the mean centres of tendons and artery are from
     the bones', across and in depth. A feature costs nothing inside the range that the labelled planes of the training
-    volumes span; outside, its cost rises to at most 1. The agreement is minus the mean cost: 0 on each of these planes.
+    volumes span; outside, its cost rises to at most 1. A distance costs 1 if a tissue is absent. The agreement is minus
+    the mean cost: 0 on each of these planes.
 
     Distances are unsigned and between tissues, so that they are the same for left and right hands, and do not change
     when the slice is shifted.
 
     Args:
-        targets: Target counts of the published reward. Default: (4, 3, 1).
+        targets: Target counts of the published reward, each from 1 to 1000. Default: (4, 3, 1).
         area_tolerance: Distance outside its range at which an area costs 1, as a fraction of the nearer end, from 0.001
             to 1000. Default: 0.5.
         distance_tolerance_mm: Distance outside its range, in mm, at which a distance costs 1, from 0.001 to 1000.
@@ -86,6 +87,9 @@ class AgreementReward(LandmarkReward):
         slack: Widening of an area's range at each end, as a fraction of that end, from 0 to 1: the pixels of one plane
             differ slightly between motions of the volume. Default: 0.1.
         slack_mm: Widening of a distance's range at each end, in mm, from 0 to 1000. Default: 0.5.
+
+    Raises:
+        InvalidValueError: If a value is out of its range.
     """
 
     def __init__(
@@ -203,7 +207,7 @@ def landmark_reward(clusters: TissueClusters, targets: Sequence[int] = PUBLISHED
 
     Args:
         clusters: Clusters in the slice.
-        targets: Target counts: clusters of bones, tendons and artery on a labelled plane.
+        targets: Target counts of bones, tendons and artery; see `LandmarkReward`. Default: (4, 3, 1).
 
     Raises:
         InvalidValueError: If `targets` is not three whole numbers from 1 to 1000, or `clusters` is not a
@@ -226,7 +230,7 @@ def check_reward(reward: Reward | None, targets: Sequence[int]) -> Reward:
     if reward is None:
         return LandmarkReward(targets)
     if targets != PUBLISHED_TARGETS:
-        raise InvalidValueError(f"targets is {targets} beside a reward of its own, but only one of both may be given")
+        raise InvalidValueError(f"targets is {targets} and a reward is given, too, but only one of them may be")
     if isinstance(reward, type) or not all(callable(getattr(reward, name, None)) for name in ("fit", "score")):
         raise InvalidValueError(f"reward is {reward!r}, but it must be an object with the methods of Reward")
     return reward

@@ -46,9 +46,12 @@ class PixelTissue:
     """A tissue clustered by DBSCAN on pixel coordinates; the size of a pixel does not matter.
 
     Args:
-        label: Label of the tissue in a labelmap.
-        eps_px: Neighbourhood radius in pixels.
-        min_samples: Number of neighbours, the pixel itself included, that make a core pixel.
+        label: Label of the tissue in a labelmap, from 0 to 255.
+        eps_px: Neighbourhood radius in pixels, above 0, at most 1000.
+        min_samples: Number of neighbours, the pixel itself included, that make a core pixel; from 1 to 10,000,000.
+
+    Raises:
+        InvalidValueError: If a value is out of its range.
     """
 
     label: int
@@ -70,10 +73,13 @@ class MetricTissue:
     """A tissue clustered by DBSCAN on coordinates in mm, so that one setting serves every spacing.
 
     Args:
-        label: Label of the tissue in a labelmap.
-        eps_mm: Neighbourhood radius in mm.
+        label: Label of the tissue in a labelmap, from 0 to 255.
+        eps_mm: Neighbourhood radius in mm, above 0, at most 1000; at least the longer side of a pixel.
         density: Fraction of the pixels within `eps_mm`, the pixel itself included, that must be of this tissue to make
             a core pixel, in (0, 1].
+
+    Raises:
+        InvalidValueError: If a value is out of its range.
     """
 
     label: int

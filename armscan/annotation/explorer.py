@@ -112,7 +112,7 @@ class Explorer:
             self.volume,
             self.plane,
             self.view,
-            beside=None if self.optimum is None else ReferencePlane(self.optimum, "optimal plane"),
+            reference=None if self.optimum is None else ReferencePlane(self.optimum, "optimal plane"),
             history=RewardHistory(
                 remembered, range(first, first + N_REMEMBERED), -SUCCESS_THRESHOLD, "reward by plane"
             ),
@@ -173,9 +173,9 @@ def explore(
 
     Args:
         volumes: A volume, several volumes by name or in a sequence, or a folder with or without a manifest. They
-            require no labelled plane. None: four phantoms.
-        volume: Name of the first volume to show. None: the first one.
-        clustering: Clustering rules: `pixels`, `metric`, or an `armscan.anatomy.Tissues`.
+            require no labelled plane. Default: None, four phantoms.
+        volume: Name of the first volume to show. Default: None, the first one.
+        clustering: Clustering rules: `pixels`, `metric`, or an `armscan.anatomy.Tissues`. Default: `pixels`.
 
     Returns:
         The explorer; its figure keeps it alive while it is open.

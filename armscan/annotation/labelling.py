@@ -27,7 +27,7 @@ from armscan.volumes import (
 from armscan.volumes.markups import MARKUP_SUFFIX
 from armscan.volumes.plane import shift_into
 
-# Distance in mm and degrees below which two planes are the same: what writing and reading a file rounds.
+# Largest difference, in mm and degrees, of two planes that are the same: writing and reading a file rounds.
 SAME = 1e-3
 # Finds the plane of a volume.
 Search = Callable[[LabelVolume], FoundPlane]
@@ -43,9 +43,9 @@ class LabellingOptions:
         volumes: File names of the volumes to label. Default: None, all.
         overwrite: Whether to label volumes that already have a plane. Default: False.
         pictures: Folder for the pictures; created if it does not exist.
-        markups: Whether to write a markups file for 3D Slicer beside each picture.
-        markup: Markups file with the plane of `volume`, which replaces the search.
-        volume: Name of the volume that `markup` is for; it may already have a plane.
+        markups: Whether to write a markups file for 3D Slicer beside each picture. Default: False.
+        markup: Markups file with the plane of `volume`, which replaces the search. Default: None.
+        volume: Name of the volume that `markup` is for; it may already have a plane. Default: None.
         search: Function that finds the plane of a volume. Default: None, `find_optimal_plane`.
     """
 
@@ -159,9 +159,9 @@ def _make_folder(folder: Path) -> None:
 
 
 def _write_picture(path: Path, volume: LabelVolume, action: ManipulatorAction, tissues: Tissues) -> None:
-    """Draw the slice, and the plane from two sides beside the one that the volume had before, if any."""
-    beside = None if volume.optimal_action is None else ReferencePlane(volume.optimal_action, "former plane")
-    picture = Image.fromarray(draw_plane(volume, action, view_of(volume, action, tissues=tissues), beside=beside))
+    """Draw the slice, and the plane from two sides, together with the plane that the volume had before, if any."""
+    reference = None if volume.optimal_action is None else ReferencePlane(volume.optimal_action, "former plane")
+    picture = Image.fromarray(draw_plane(volume, action, view_of(volume, action, tissues=tissues), reference=reference))
     try:
         atomic_write(path, lambda file: picture.save(file, "PNG"))
     except OSError as error:

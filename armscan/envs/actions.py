@@ -34,6 +34,9 @@ class ActionBounds:
     Args:
         rotation_deg: Bounds of rz and rx, in degrees, each in [0, 180].
         translation_mm: Bounds of tx and ty, in mm, each in [0, 1e6].
+
+    Raises:
+        InvalidValueError: If a bound is out of its range.
     """
 
     rotation_deg: tuple[float, float]

@@ -84,13 +84,14 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
         projection: Free components: `x`, `y`, `xy`, `zy`, `full`, or a list of `rz`, `rx`, `tx`, `ty`. Default: `y`.
         reward: Object with the methods of `armscan.anatomy.Reward`; one that needs fitting is fitted to the labelled
             planes of these volumes. Default: None, the published reward.
-        targets: Target counts of the published reward: clusters of bones, tendons and artery. Default: (4, 3, 1).
+        targets: Target counts of the published reward: clusters of bones, tendons and artery, each from 1 to 1000; not
+            with another `reward`. Default: (4, 3, 1).
         clustering: Clustering rules: `pixels`, as published; `metric`, for every spacing; or an
             `armscan.anatomy.Tissues`. Default: `pixels`.
         success_threshold: Threshold of success, in (0, 1]: a plane whose reward is above -success_threshold succeeds.
             Default: 0.05.
-        ends: What ends an episode before `max_steps`: `on_reward`, `on_budget` (nothing) or `on_stop`. Default:
-            `on_reward`.
+        ends: Event that ends an episode before `max_steps`: `on_reward`, `on_budget` (none) or `on_stop`; see above.
+            Default: `on_reward`.
         max_steps: Number of steps after which an episode is truncated, 1 or more. Default: 50.
         start: Plane at the start, `middle` or `random`. Default: `middle`.
         rotation_bounds_deg: Bounds of rz and rx in degrees, each in [0, 180]. Default: (180, 180).
@@ -101,7 +102,9 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
     Raises:
         InvalidValueError: If an argument is invalid.
         OptimalPlaneError: If a volume's labelled plane is missing, outside the bounds, or not above -success_threshold.
-        DisplayError: If the mode is `human` and no window can be opened.
+        VolumeError: If the folder or a file cannot be used.
+        ManifestError: If the folder's manifest is missing or damaged.
+        DisplayError: If `render_mode` is `human` and no window can be opened.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - as Gymnasium declares it

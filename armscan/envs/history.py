@@ -63,8 +63,8 @@ def check_exclusions(excluded: Any, boxes: Mapping[str, spaces.Box]) -> frozense
     is_collection = isinstance(excluded, list | tuple | set | frozenset)
     if not is_collection or not all(isinstance(name, str) and name in named for name in excluded):
         raise InvalidValueError(
-            f"stack_exclude is {excluded!r}, but it must be a list of "
-            f"{listed(named) if named else 'nothing, because the observation is one vector'}"
+            f"stack_exclude is {excluded!r}, but it must be "
+            f"{f'a list of {listed(named)}' if named else 'empty, because the observation is one vector'}"
         )
     return frozenset(excluded)
 

@@ -113,7 +113,7 @@ def side_panels(
 
     Args:
         volume: Volume to draw.
-        transform: Motion of the volume in the episode. None: no motion.
+        transform: Motion of the volume in the episode; None: no motion.
         planes: Planes to outline, in the frame of the moved volume, each with its colour and its line width in pixels;
             the last one is on top.
         rooms: Size (width, height) in pixels that each picture fits into; its aspect ratio is kept.

@@ -66,7 +66,7 @@ def draw_frame(episode: Episode) -> NDArray[np.uint8]:
         episode.plane,
         episode.view,
         transform=scene.transform,
-        beside=ReferencePlane(scene.optimum, "optimal plane"),
+        reference=ReferencePlane(scene.optimum, "optimal plane"),
         history=RewardHistory(episode.rewards, range(rules.max_steps + 1), -rules.success_threshold, "reward by step"),
         caption=f"step {episode.n_steps}",
     )
@@ -78,7 +78,7 @@ def draw_plane(
     view: View,
     *,
     transform: RigidTransform | None = None,
-    beside: ReferencePlane | None = None,
+    reference: ReferencePlane | None = None,
     history: RewardHistory | None = None,
     caption: str = "",
 ) -> NDArray[np.uint8]:
@@ -88,17 +88,17 @@ def draw_plane(
         volume: Volume that the plane lies in.
         plane: Plane to draw, in the frame of the moved volume.
         view: Slice at the plane, with its clusters.
-        transform: Motion of the volume. None: no motion.
-        beside: Another plane to draw, and to measure the distance from.
-        history: Rewards up to this plane. None: not drawn.
-        caption: Text before the reward.
+        transform: Motion of the volume. Default: None, no motion.
+        reference: Another plane to draw, and to measure the distance from. Default: None.
+        history: Rewards up to this plane. Default: None, not drawn.
+        caption: Text before the reward. Default: none.
 
     Returns:
         The picture, shape (512, 860, 3).
     """
     picture = Image.new("RGB", (WIDTH, HEIGHT), BACKGROUND)
     draw = ImageDraw.Draw(picture)
-    planes = [] if beside is None else [(beside.action, OPTIMUM_INK, 1)]
+    planes = [] if reference is None else [(reference.action, OPTIMUM_INK, 1)]
     planes.append((plane, PLANE_INK, 2))
     # With fingers at low Y, as in phantoms.
     seen_from = "fingers" if is_right_handed(volume) else "elbow"
@@ -114,16 +114,21 @@ def draw_plane(
         _place(picture, draw, REWARD_BOX, history.title, panel)
         goal_at = REWARD_BOX[2], REWARD_BOX[1] - TITLE_GAP
         draw.text(goal_at, f"goal: above {history.threshold:g}", fill=INK, font=font(14), anchor="rs")
-    _write_facts(draw, volume, plane, view, beside, caption)
-    _write_legend(draw, beside)
+    _write_facts(draw, volume, plane, view, reference, caption)
+    _write_legend(draw, reference)
     return np.asarray(picture)
 
 
 def view_of(volume: LabelVolume, plane: ManipulatorAction, *, tissues: Tissues = PIXEL_TISSUES) -> View:
     """Look at a plane of an unmoved volume, outside an episode.
 
+    Args:
+        volume: Volume to look at.
+        plane: Plane in the volume's frame.
+        tissues: Clustering rule of each tissue. Default: `PIXEL_TISSUES`.
+
     Returns:
-        View of the plane; its `action` is empty.
+        View of the plane, with the published reward and an empty `action`.
     """
     slice_xz, landmarks = Scanner([volume], tissues).look(0, plane)
     return View(
@@ -151,7 +156,7 @@ def _write_facts(
     volume: LabelVolume,
     plane: ManipulatorAction,
     view: View,
-    beside: ReferencePlane | None,
+    reference: ReferencePlane | None,
     caption: str,
 ) -> None:
     x, y = FACTS_AT
@@ -165,9 +170,9 @@ def _write_facts(
         f"rz {rz:.1f}°, rx {rx:.1f}°",
         f"tx {tx:.1f} mm, ty {ty:.1f} mm",
     ]
-    if beside is not None:
-        distance_mm, distance_deg = plane_distance(plane, beside.action, volume.slice_centre_mm)
-        lines += [f"{distance_mm:.1f} mm and {distance_deg:.1f}°", f"from the {beside.name}"]
+    if reference is not None:
+        distance_mm, distance_deg = plane_distance(plane, reference.action, volume.slice_centre_mm)
+        lines += [f"{distance_mm:.1f} mm and {distance_deg:.1f}°", f"from the {reference.name}"]
     for row, line in enumerate(lines):
         draw.text((x, y + 38 + 22 * row), _shortened(line), fill=INK, font=font(15))
 
@@ -182,9 +187,9 @@ def _shortened(line: str) -> str:
     return shortened
 
 
-def _write_legend(draw: ImageDraw.ImageDraw, beside: ReferencePlane | None) -> None:
+def _write_legend(draw: ImageDraw.ImageDraw, reference: ReferencePlane | None) -> None:
     x, y = LEGEND_AT
-    legend = [("current plane", PLANE_INK)] + ([(beside.name, OPTIMUM_INK)] if beside else [])
+    legend = [("current plane", PLANE_INK)] + ([(reference.name, OPTIMUM_INK)] if reference else [])
     legend += [(name, tuple(TISSUE_INKS[label].tolist())) for label, name in LABEL_NAMES.items() if label > 0]
     for text, ink in legend:
         draw.text((x, y), text, fill=ink, font=font(15))

@@ -79,7 +79,7 @@ class Rules:
             transform=transform,
         )
         self._scanner = Scanner(list(self.volumes.values()), self.tissues)
-        self._place = {name: place for place, name in enumerate(self.names)}
+        self._index = {name: index for index, name in enumerate(self.names)}
         self._labelled_views: dict[str, View] = {}
         self._check_optimal_planes()
         self.free = free_components(projection)
@@ -111,7 +111,7 @@ class Rules:
         if len(scenes) == 1:
             return [self.look_at(scenes[0], actions[0])]
         slices, landmarks = self._scanner.look_all(
-            np.array([self._place[scene.volume.name] for scene in scenes]),
+            np.array([self._index[scene.volume.name] for scene in scenes]),
             np.array([action.rotation + action.translation for action in actions]),
             np.array([scene.maps for scene in scenes]),
         )
@@ -119,7 +119,7 @@ class Rules:
 
     def look_at(self, scene: Scene, action: ManipulatorAction) -> View:
         """Look at one plane, as `look` does."""
-        return self._view(scene, *self._scanner.look(self._place[scene.volume.name], action, scene.maps))
+        return self._view(scene, *self._scanner.look(self._index[scene.volume.name], action, scene.maps))
 
     @property
     def transform(self) -> RandomTransform | None:
@@ -217,12 +217,12 @@ class Rules:
         score = self.reward.score(landmarks, volume.pixel_mm)
         if type(score) is float and -1.0 <= score <= 0.0:
             return score
-        return check_float(f"what {type(self.reward).__name__} scored", score, at_least=-1.0, at_most=0.0)
+        return check_float(f"the score of {type(self.reward).__name__}", score, at_least=-1.0, at_most=0.0)
 
     def _check_optimal_planes(self) -> None:
         for volume in self.volumes.values():
             scene = self._sampler.unmoved(volume)
-            _, landmarks = self._scanner.look(self._place[volume.name], scene.optimum)
+            _, landmarks = self._scanner.look(self._index[volume.name], scene.optimum)
             score = self._score(landmarks, volume)
             if score <= -self.success_threshold:
                 counts = tuple(landmarks[:, 0].astype(int).tolist())

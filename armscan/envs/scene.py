@@ -47,8 +47,10 @@ class RandomTransform:
             separately, from 0 to 0.3. Default: 0.
         shear: Largest shear, in mm of shift per mm along another axis, from 0 to 0.3: across and depth shift with the
             position along the labelled normal, and with each other. Default: 0.
-        mirror: Whether to mirror an episode's volume, so that it shows the other hand, with probability 0.5. Default:
-            False.
+        mirror: Whether to mirror the volume with probability 0.5, so that it shows the other hand. Default: False.
+
+    Raises:
+        InvalidValueError: If a value is out of its range.
     """
 
     rz_deg: float = 10.0

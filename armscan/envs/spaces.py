@@ -61,7 +61,7 @@ def in_order(parts: Parts, shapes: Mapping[str, tuple[int, ...]], leading: tuple
 
 
 def flat_space(boxes: Mapping[str, spaces.Box]) -> spaces.Box:
-    """Return the space of what `flatten` returns: the bounds of all parts, in their order."""
+    """Return the space of flattened observations, with the bounds of all parts in their order; see `flatten`."""
     low = np.concatenate([box.low.ravel() for box in boxes.values()])
     high = np.concatenate([box.high.ravel() for box in boxes.values()])
     return spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)

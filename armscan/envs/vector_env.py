@@ -32,7 +32,7 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
         num_envs: Number of environments, from 1 to 65,536. Default: 1.
         volumes: Volumes of the environments; see `ArmscanEnv`. Default: None, four phantoms.
         autoreset_mode: Autoreset mode of Gymnasium, `NextStep` or `Disabled`. Default: `NextStep`.
-        render_mode: Must be None: rendering is not supported.
+        render_mode: Must be None: rendering is not supported. Default: None.
         **rules: The other arguments of `ArmscanEnv`.
 
     Attributes:
@@ -93,10 +93,14 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
             seed: Seed of the first environment, counted up for the others, or a list with one for each. Default: None,
                 the random generators go on.
             options: `volume`: name of a volume for all, or a list with one for each; `reset_mask`: environments to
-                reset, booleans of shape (num_envs,).
+                reset, booleans of shape (num_envs,). Default: None, all environments with drawn volumes.
 
         Returns:
             The observations and `info` of all environments; only those that were reset are marked in `info`.
+
+        Raises:
+            InvalidValueError: If `seed` or `options` is invalid.
+            ResetNeededError: If an environment that is not reset has no episode yet.
         """
         options = dict(options) if isinstance(options, dict) else options
         mask = self._popped_mask(options)
@@ -117,6 +121,10 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
             actions: Actions, a row for each environment that takes a step.
             env_ids: Indices of these environments, each at most once; results have a row for each of them, in this
                 order, and other environments do not change. Default: None, all environments.
+
+        Raises:
+            InvalidValueError: If the actions or `env_ids` are invalid.
+            ResetNeededError: If an episode has not begun, or, without autoreset, has ended.
         """
         chosen = np.arange(self.num_envs) if env_ids is None else self._checked_ids(env_ids)
         episodes = self.episodes(chosen)
@@ -205,8 +213,8 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
             if in_order[0] >= 0 and in_order[-1] < self.num_envs and (in_order[1:] > in_order[:-1]).all():
                 return ids.astype(np.int64, copy=False)
         raise InvalidValueError(
-            f"env_ids is {env_ids!r}, but it must hold at least one, and each once, of the numbers of the "
-            f"{self.num_envs} environments, from 0"
+            f"env_ids is {env_ids!r}, but it must hold one or more different indices, from 0, of the {self.num_envs} "
+            "environments"
         )
 
     def _seeds(self, seed: int | Sequence[int | None] | None) -> Sequence[int | None]:
@@ -217,7 +225,7 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
             return [first + i for i in range(self.num_envs)]
         if not isinstance(seed, list | tuple) or len(seed) != self.num_envs:
             raise InvalidValueError(
-                f"seed is {seed!r}, but it must be a whole number, or a list of one for each of {self.num_envs}"
+                f"seed is {seed!r}, but it must be a whole number, or a list with one for each of {self.num_envs}"
             )
         return [None if one is None else check_int("each of seed", one, at_least=0) for one in seed]
 

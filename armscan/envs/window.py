@@ -24,6 +24,10 @@ class Window:
 
     A window that a person closes stays closed until `close` has been called and another picture comes.
 
+    Args:
+        title: Title of the window.
+        frames_per_s: Most pictures a second, above 0.
+
     Raises:
         DisplayError: If no window can be shown here.
     """
@@ -73,7 +77,7 @@ def picture_figure(title: str, picture: NDArray[np.uint8], height_below: int = 0
     Args:
         title: Title of the window.
         picture: Picture, shape (height, width, 3).
-        height_below: Height left free below the picture, in pixels.
+        height_below: Height left free below the picture, in pixels. Default: 0.
     """
     from matplotlib import pyplot
 

@@ -74,7 +74,7 @@ class FrameStack(_HistoryWrapper):
     Args:
         env: Environment whose observation is a vector or a `Dict` of boxes.
         stack: Number of latest observations to stack, from 1 to 1000.
-        exclude: Parts of a `Dict` observation that are not stacked.
+        exclude: Parts of a `Dict` observation that are not stacked. Default: none.
 
     Raises:
         InvalidValueError: If `stack` is not a whole number from 1 to 1000, or an excluded part does not exist.

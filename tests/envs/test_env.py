@@ -361,7 +361,7 @@ class Broken:
 
 @pytest.mark.parametrize("given", [5.0, -1.5, float("nan"), None, "best", np.zeros(1)])
 def test_env_refuses_what_a_reward_of_ones_own_may_not_give(wrist, given):
-    with pytest.raises(InvalidValueError, match="what Broken scored is"):
+    with pytest.raises(InvalidValueError, match="the score of Broken is"):
         ArmscanEnv([wrist], reward=Broken(given))
 
 

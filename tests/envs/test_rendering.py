@@ -142,7 +142,7 @@ def test_draw_plane_without_an_episode_names_no_step_and_no_optimal_plane(phanto
     assert f"reward {view.reward:.3f}" in written
     assert not [text for text in written if "step" in text or "optimal" in text or "from the p" in text[:10]]
     written.clear()
-    draw_plane(phantom, plane, view, beside=ReferencePlane(plane, "former plane"))
+    draw_plane(phantom, plane, view, reference=ReferencePlane(plane, "former plane"))
     assert {"former plane", "0.0 mm and 0.0°", "from the former plane"} <= set(written)
 
 
