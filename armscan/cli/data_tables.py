@@ -103,7 +103,7 @@ def _tissue_table(report: VolumeReport) -> Table:
         amounts = (str(report.n_voxels[tissue]), f"{report.tissue_mm3[tissue]:.0f}") if is_there else ()
         table.add_row(tissue, Text(sources or "-"), *amounts)
     if report.stored.missing:
-        table.add_row("not there", Text(shown(report.stored.missing)))
+        table.add_row("missing", Text(shown(report.stored.missing)))
     return table
 
 

@@ -55,7 +55,7 @@ SELECTION = (
         default="-started",
         help=f"Sort by {', '.join(SORTS)}; -KEY sorts in descending order. plane: on-plane rate.",
     ),
-    click.option("--limit", type=click.IntRange(1), help="Only so many runs."),
+    click.option("--limit", type=click.IntRange(1), help="Maximum number of runs."),
 )
 
 
@@ -121,8 +121,9 @@ def show(run: str, tracking: str) -> None:
 def prune(what: str, apply: bool, tracking: str, sort: str, limit: int | None, **selected: Any) -> int:
     """Remove checkpoints or folders of ended runs.
 
-    checkpoints: those in their folders; of a failed or killed run, the only copies. folders: all of their files on this
-    machine. The store is not changed: MLflow deletes runs and artifacts. docs/runs.md says what is never removed.
+    checkpoints: those in the runs' folders; of a failed or killed run, the only copies. folders: all files of the runs
+    on this machine. The store does not change: delete runs and artifacts with MLflow. docs/runs.md says what is never
+    removed.
     """
     from rich.filesize import decimal
 

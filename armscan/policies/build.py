@@ -88,6 +88,12 @@ def tags_of_kept(folder: Path) -> dict[str, str]:
 def make_model(agent: Learner, env: Env, folder: Path, facts: Mapping[str, Any]) -> None:
     """Write an agent's policy as a model, replacing an earlier one; a model that fails a check is not written.
 
+    Args:
+        agent: Agent whose policy is written.
+        env: Environment of its observations.
+        folder: Folder of the model.
+        facts: Metadata of the model; see `facts_of`.
+
     Raises:
         ExportError: If the policy cannot be exported, or the model does not answer as the agent does.
     """
@@ -112,7 +118,14 @@ def make_model(agent: Learner, env: Env, folder: Path, facts: Mapping[str, Any])
 
 
 def facts_of(config: Mapping[str, Any], env: Env, run_id: str, slice_px: tuple[int, int]) -> dict[str, Any]:
-    """Return the metadata of a model: its origin, its observations, and the meaning of its actions."""
+    """Return the metadata of a model: its origin, its observations, and the meaning of its actions.
+
+    Args:
+        config: Resolved configuration of the run.
+        env: Environment of the observations.
+        run_id: MLflow run ID.
+        slice_px: Largest shape that fits into the slices of the run's volumes; see `save_policy`.
+    """
     rules = config["env"]
     ways: dict[str, Any] = {"tx": "the volume's size across", "ty": "the volume's size along the arm"}
     if rules["translation_bounds_mm"] is not None:

@@ -61,7 +61,7 @@ def colours(n: int) -> list[str]:
 
 
 def learning_curves(groups: Sequence[Group], curves: Curves, titles: Mapping[str, str], *, is_detailed: bool) -> Figure:
-    """Return metrics below each other, with switches for the axis and for the lines of single seeds.
+    """Return metrics one below the other, with switches for the axis and for the lines of single seeds.
 
     Args:
         groups: Groups that are drawn.

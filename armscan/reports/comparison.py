@@ -43,15 +43,15 @@ HOW_CURVES = (
 )
 MEANS_ALONE = "Of so many groups only the means are drawn: curves.csv has the bands, seed_curves.csv the seeds."
 HOW_FINAL = (
-    "The final evaluation, with the weights of the best epoch, on test volumes that had no part in anything before, "
+    "The final evaluation, with the weights of the best epoch, on test volumes that nothing before has used, "
     "over all episodes of all seeds, beside the baselines. In the chart diamonds are these figures, dots the seeds."
 )
 HOW_BETTER = (
     "How likely a training of the row's group is better than one of the column's group: the share of pairs of seeds, "
     "ties counting half, averaged over the test volumes "
     '(<a href="https://arxiv.org/abs/2108.13264">Agarwal et al. 2021</a>), with a 95 % interval for other seeds '
-    '(<a href="https://doi.org/10.1002/sim.2324">Newcombe 2006</a>; of many groups shown under the pointer). 0.5 is no '
-    "difference; in bold where the interval leaves it out. Columns are numbered as the rows."
+    '(<a href="https://doi.org/10.1002/sim.2324">Newcombe 2006</a>; with many groups, shown under the pointer). 0.5 is '
+    "no difference; bold: the interval excludes it. Columns are numbered like the rows."
 )
 
 

@@ -44,11 +44,16 @@ NOTHING = Curve(np.empty(0), Band(*[np.empty(0)] * 3), 0, {})
 
 
 def curve_of(group: Group, figure: str, axis: str) -> Curve | None:
-    """Return the curve of a group over one of `AXES`; None if none of its trainings has measured the metric.
+    """Return the curve of a group; None if none of its trainings has measured the metric.
 
     Values are interpolated linearly between validations. A training that has ended keeps its last value while others of
     its group continue. Where one was cut off, or its metric became NaN, the curve ends. It begins where all have
     measured a value.
+
+    Args:
+        group: Group of the curve.
+        figure: Name of the metric.
+        axis: Name of the axis, a key of `AXES`.
     """
     trainings = of_common_folds(training for training in group.trainings if figure in training.series)
     lines = [_line(training.series[figure], axis) for training in trainings]

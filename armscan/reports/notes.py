@@ -27,7 +27,7 @@ def notes_on(
         groups: Groups to compare.
         left_out: Trainings that repeat another one.
         curves: Learning curves of the groups.
-        has_other_volumes: Whether some groups were tested on other volumes than others.
+        has_other_volumes: Whether groups were tested on different volumes.
     """
     notes = [
         *_on_folds(groups),
@@ -86,14 +86,14 @@ def _on_subjects(groups: Sequence[Group]) -> Iterator[str]:
         played = [episode for each in evaluations_by_seed(group).values() for episode in each.episodes]
         n_subjects[group.number] = len({episode.subject or episode.volume for episode in played})
     if few := [number for number, n in n_subjects.items() if 0 < n < MIN_SUBJECTS]:
-        yield f"{_numbered(few, groups)}: fewer than {MIN_SUBJECTS} test subjects; intervals are too narrow for others."
+        yield f"{_numbered(few, groups)}: fewer than {MIN_SUBJECTS} test subjects: intervals are too narrow."
 
 
 def _on_unfinished(groups: Sequence[Group]) -> Iterator[str]:
     unfinished = [(group, training) for group in groups for training in group.trainings if not training.is_whole]
     if unfinished:
         which = [f"{_named(group, training)}: {training.status}" for group, training in unfinished]
-        yield f"Not run to the end, and here with what they have: {'; '.join(which)}."
+        yield f"Unfinished, and shown with the data so far: {'; '.join(which)}."
 
 
 def _on_missing(groups: Sequence[Group]) -> Iterator[str]:
@@ -122,7 +122,7 @@ def _on_commits(groups: Sequence[Group]) -> Iterator[str]:
     for group in groups:
         if len(group.commits) > 1:
             commits = ", ".join(sorted(commit[:ID_CHARS] for commit in group.commits))
-            yield f"Group {group.number}: its runs are of different versions of armscan: {commits}."
+            yield f"Group {group.number}: its runs used different versions of armscan: {commits}."
 
 
 def _on_volumes(groups: Sequence[Group]) -> Iterator[str]:
@@ -135,11 +135,11 @@ def _on_volumes(groups: Sequence[Group]) -> Iterator[str]:
 
 def _on_rules(groups: Sequence[Group], *, has_other_volumes: bool) -> Iterator[str]:
     if rules := differing_rules(groups):
-        yield f"The groups' episodes have other rules ({', '.join(rules)}): their figures are those of different tasks."
+        yield f"The groups' episodes have different rules ({', '.join(rules)}): their figures are of different tasks."
     if has_other_volumes:
         yield (
-            "Not all groups were judged on the same test volumes: pairs that were not are left out where it is asked "
-            "which is better, and their figures differ by the volumes, too."
+            "Not all groups were judged on the same test volumes: pairs that were not are not compared, and their "
+            "figures also differ because of the volumes."
         )
 
 

@@ -24,13 +24,13 @@ def compare_runs(text: str, uri: str, out: Path | None) -> Path:
     Args:
         text: Names of the runs; see `read_runs`.
         uri: Address of their store.
-        out: Folder that takes the report. None: a folder in `reports`, named after the runs.
+        out: Folder for the report; None: a folder in `reports`, named after the runs.
 
     Returns:
         The HTML file.
 
     Raises:
-        InvalidValueError: If one of the names is empty.
+        InvalidValueError: If one of the names is empty, or the report would replace files that are not a report's.
         TrackingError: If one of them is not found, cannot be compared, or has a damaged file.
     """
     named = read_runs(text)

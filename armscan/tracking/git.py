@@ -63,7 +63,7 @@ def code_state_in(folder: Path) -> CodeState:
 
 
 def _diff(tree: Path) -> bytes:
-    """Return the diff of a working tree from its commit, including new files; change nothing."""
+    """Return the diff of a working tree from its commit, including new files, without changing the index."""
     new = [name for name in _git(tree, "ls-files", "--others", "--exclude-standard", "-z").split(b"\0") if name]
     left_out = {name: why for name in new if (why := _why_left_out(tree, name))}
     told = "".join(f"# not kept, {why}: {os.fsdecode(name)!r}\n" for name, why in left_out.items()).encode()

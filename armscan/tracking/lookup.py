@@ -43,7 +43,7 @@ class FoundRun:
         status: Status of the run, such as RUNNING or FINISHED.
         tags: Tags of the run.
         files: Paths of its artifacts.
-        needs_trust: Whether, judging by its parameters, its configuration is read with `--trust` only.
+        needs_trust: Whether its configuration, judging by its parameters, can only be read with `--trust`.
     """
 
     client: TrackingStore = field(repr=False)
@@ -150,7 +150,7 @@ def find_run(client: TrackingStore, run_id: str) -> Run:
         max_results=N_SHOWN + 1,
     )
     if not found:
-        raise TrackingError(f"the run is {run_id!r}, but no run of {client.uri} has an ID that begins so")
+        raise TrackingError(f"the run is {run_id!r}, but no run of {client.uri} has an ID that begins with it")
     if len(found) > 1:
         ids = [run.info.run_id for run in found[:N_SHOWN]] + (["others"] if len(found) > N_SHOWN else [])
         raise TrackingError(f"the run is {run_id!r}, but that may be {listed(ids)}: give more of the ID")
@@ -183,11 +183,13 @@ def run_of_study(
         raise TrackingError(f"{where}: {error}") from error
     if run.info.experiment_id != experiment_id:
         raise TrackingError(
-            f"{where} names run {run_id}, which is another's, as its experiment says: left as it is (was "
-            "tracking.experiment another before?)"
+            f"{where} names run {run_id}, which is another's: it is in another experiment, and left "
+            "unchanged (has tracking.experiment changed since?)"
         )
     if others := [name for name, value in tags.items() if run.data.tags.get(name) != value]:
-        raise TrackingError(f"{where} names run {run_id}, which is another's, as its {others[0]} says: left as it is")
+        raise TrackingError(
+            f"{where} names run {run_id}, which is another's, as its tag {others[0]} says: it is left unchanged"
+        )
     return run
 
 
@@ -217,7 +219,9 @@ def check_version(run: Run) -> None:
     try:
         is_newer = Version(version).release > Version(armscan.__version__).release
     except InvalidVersion as error:
-        raise TrackingError(f"run {run.info.run_id}: its tag {VERSION_TAG} is {version[:50]!r}, no version") from error
+        raise TrackingError(
+            f"run {run.info.run_id}: its tag {VERSION_TAG} is {version[:50]!r}, not a version"
+        ) from error
     if is_newer:
         raise TrackingError(
             f"run {run.info.run_id} was made by armscan {version}, but this is {armscan.__version__}: "

@@ -87,7 +87,7 @@ class OutboxFile:
                 yield self._read(line)
 
     def next_entries(self, channel: Channel, at_most: int) -> tuple[list[Entry], int]:
-        """Return the next entries of a channel to upload.
+        """Return up to `at_most` entries of a channel, the next ones to upload.
 
         Returns:
             The entries, and the position behind them, for `mark`.
@@ -128,7 +128,7 @@ class OutboxFile:
         except ValueError:
             entry = None
         if not isinstance(entry, dict):
-            raise TrackingError(f"{self.file}: a line of it is damaged: {line[:50]!r}")
+            raise TrackingError(f"{self.file}: a line is damaged: {line[:50]!r}")
         return entry
 
     def _read_uploaded(self) -> dict[Channel, int]:
@@ -152,7 +152,7 @@ class Outbox(OutboxFile):
 
     Args:
         file: File with an `Address` in its first line.
-        timeout_s: Seconds to wait for another process that has locked the file.
+        timeout_s: Seconds to wait for another process that has locked the file. Default: 20.
 
     Raises:
         TrackingError: If the file is damaged.
@@ -167,7 +167,7 @@ class Outbox(OutboxFile):
         links = [each for each in (file.parent, *map(file.with_suffix, OUTBOX_SUFFIXES)) if each.is_symlink()]
         if links:
             raise TrackingError(f"{links[0]}: is a link, but outboxes are files of the run's own folder")
-        # A process that is told to leave releases it from another thread.
+        # A process that is asked to stop releases it from another thread.
         self._lock = FileLock(file.with_suffix(LOCK), timeout=timeout_s, thread_local=False)
         try:
             self._lock.acquire()
@@ -177,7 +177,7 @@ class Outbox(OutboxFile):
             truncate_torn_line(file)
             super().__init__(file)
             self._appending, self._adding = file.open("ab", buffering=0), threading.Lock()
-            # The files that this process has added.
+            # Files that this process has added.
             self.added: set[str] = set()
         except BaseException:
             self._lock.release()
@@ -252,7 +252,13 @@ def outbox_files(folder: Path) -> list[Path]:
 
 
 def take_over(run_id: str, before: Path, folder: Path) -> None:
-    """Move the outbox of a run, if there is one, to the folder in which the run is resumed."""
+    """Move the outbox of a run, if there is one, to the folder in which the run is resumed.
+
+    Args:
+        run_id: MLflow run ID.
+        before: Folder in which the run was tracked before.
+        folder: Folder in which it is resumed.
+    """
     old, new = file_of(before, run_id), file_of(folder, run_id)
     if old.exists():
         new.parent.mkdir(parents=True, exist_ok=True)

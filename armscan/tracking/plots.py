@@ -13,7 +13,13 @@ if TYPE_CHECKING:
 
 
 def draw_learning_curve(reports: Sequence[EpochReport], path: Path, *, title: str) -> None:
-    """Draw on-plane rate, success rate and mean steps by environment step, as a PNG file."""
+    """Draw on-plane rate, success rate and mean steps by environment step.
+
+    Args:
+        reports: Reports of the epochs, one or more.
+        path: File to write; its suffix, such as `.png`, is its format.
+        title: Title of the figure.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

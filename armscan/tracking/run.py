@@ -154,13 +154,13 @@ class TrackedRun:
         """Mark the run's trial as pruned, with a tag and in the run's name."""
         self.set_tags({PRUNED_TAG: "true", "mlflow.runName": f"{self.name.removesuffix(PRUNED)}{PRUNED}"})
 
-    def log_datasets(self, prints: Mapping[str, Mapping[str, str]]) -> None:
+    def log_datasets(self, fingerprints: Mapping[str, Mapping[str, str]]) -> None:
         """Log the volumes as datasets of the run.
 
         Args:
-            prints: Fingerprints of the volumes, by split (training, validation, test) and name.
+            fingerprints: Fingerprints of the volumes, by split (training, validation, test) and name.
         """
-        self._add(datasets=[[part, volumes] for part, volumes in prints.items() if volumes])
+        self._add(datasets=[[part, volumes] for part, volumes in fingerprints.items() if volumes])
 
     def _log_config(self, config: Mapping[str, Any], known: Collection[str] = ()) -> None:
         # MLflow refuses to change a parameter, such as the device.

@@ -68,7 +68,8 @@ def open_store(
         The store, and the experiment's ID.
 
     Raises:
-        TrackingError: If the store cannot be reached or used.
+        TrackingError: If the store cannot be reached or used, or a name or address is invalid.
+        InvalidValueError: If another setting is invalid.
     """
     check_settings(
         uri,

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 # Statuses of a run that has ended, as its outbox holds them.
 ENDED = ("FINISHED", "FAILED", "KILLED")
 PROCESS_DIED, FOLDER_REMOVED = "its process died", "its process died, and its folder was removed"
-IN_USE = "it is still going on"
+IN_USE = "it is still in progress"
 # Stores whose pending entries this process has looked for.
 _looked_for: set[str] = set()
 
@@ -202,6 +202,11 @@ def fail_dead_runs(folder: Path, store: TrackingStore, reason: str) -> None:
     """Mark the runs of dead processes in a folder tree as FAILED.
 
     Entries that the store cannot take now stay in the folders of the runs.
+
+    Args:
+        folder: Folder of the runs, or above them.
+        store: Store of the runs.
+        reason: Reason of the failure, for the tag `failure`.
     """
     for file in outbox_files(folder):
         try:
@@ -224,7 +229,15 @@ def begin_outbox(folder: Path, run_id: str, uri: str) -> Outbox:
 
 
 def note_end(folder: Path, run_id: str, uri: str, status: str, tags: Mapping[str, str]) -> None:
-    """Record a run's end in its outbox, for `sync` to upload, without contacting the store."""
+    """Record a run's end in its outbox, for `sync` to upload, without contacting the store.
+
+    Args:
+        folder: Folder of the run.
+        run_id: MLflow run ID.
+        uri: Address of its tracking store.
+        status: FINISHED, FAILED or KILLED.
+        tags: Tags to set.
+    """
     with contextlib.closing(begin_outbox(folder, run_id, uri)) as outbox:
         if tags:
             outbox.add(tags=tags_of(tags))

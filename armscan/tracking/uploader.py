@@ -160,18 +160,18 @@ def upload(
         n_uploaded += len(entries)
 
 
-def dataset_input(part: str, prints: Mapping[str, str]) -> DatasetInput:
+def dataset_input(part: str, fingerprints: Mapping[str, str]) -> DatasetInput:
     """Return volumes as an MLflow dataset, with a digest of their fingerprints.
 
     Args:
         part: Split of the volumes: `training`, `validation` or `test`.
-        prints: Fingerprint of each volume by its name.
+        fingerprints: Fingerprint of each volume by its name.
     """
     from mlflow.entities import Dataset, DatasetInput, InputTag
 
-    digest = sha256("".join(sorted(prints.values())).encode())[:DIGEST_CHARS]
-    profile = json.dumps({"volumes": len(prints)})
-    source = truncate(" ".join(prints), MAX_PARAM_CHARS, VOLUMES_FILE)
+    digest = sha256("".join(sorted(fingerprints.values())).encode())[:DIGEST_CHARS]
+    profile = json.dumps({"volumes": len(fingerprints)})
+    source = truncate(" ".join(fingerprints), MAX_PARAM_CHARS, VOLUMES_FILE)
     dataset = Dataset(f"{part} volumes", digest, "armscan", json.dumps({"volumes": source}), profile=profile)
     return DatasetInput(dataset, [InputTag("mlflow.data.context", part)])
 

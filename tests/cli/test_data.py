@@ -38,7 +38,7 @@ def test_data_command_tells_what_each_volume_holds(write_labelmap, tmp_path, ins
         "30 x 11 x 12 voxels of 0.3 x 0.4 x 0.5 mm, axes towards LPS; read from 30 x 20 x 12",
         "cropped to y from 0 to 4 mm",
         "b.nrrd: subject b.nrrd, for train, no labelled plane",
-        "not there",
+        "missing",
         "note: y, along the arm, is not the longest of 9 x 4 x 6 mm; axes in the manifest orders them",
         "c.nrrd: excluded ([bold] motion)",
         "bones",

@@ -107,7 +107,7 @@ def test_configuration_that_was_made_to_harm_is_one_line(armscan, tmp_path, text
     [
         (DOMAIN_TAG, "x", "no training domain can be read from 'x'"),
         (DOMAIN_TAG, '{"observed": 3}', "no training domain can be read from"),
-        (VERSION_TAG, "x", f"its tag {VERSION_TAG} is 'x', no version"),
+        (VERSION_TAG, "x", f"its tag {VERSION_TAG} is 'x', not a version"),
     ],
 )
 def test_tag_that_is_not_what_armscan_writes_is_one_line(armscan, tmp_path, tag, value, line):

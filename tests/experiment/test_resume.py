@@ -313,7 +313,7 @@ def test_resume_refuses_a_run_of_a_newer_version(answer, cut_off):
 @pytest.mark.parametrize(
     ("tag", "value", "line"),
     [
-        ("armscan.version", "x", "its tag armscan.version is 'x', no version"),
+        ("armscan.version", "x", "its tag armscan.version is 'x', not a version"),
         ("config.sha256", None, "has no tag config.sha256"),
         ("working_folder", None, "has no tag working_folder"),
         ("working_folder", "/nowhere", "that folder cannot be entered (No such file or directory)"),

@@ -126,7 +126,7 @@ def test_runs_that_were_left_out_and_rules_that_differ_are_said(written, make_tr
         make_training(0, params={"env.success_threshold": "0.01"}),
     )
     assert "another run has the same configuration and seed: aaaaaaaa (seed 0)." in page
-    assert "have other rules (env.success_threshold)" in page
+    assert "have different rules (env.success_threshold)" in page
 
 
 def test_groups_have_the_ids_of_their_runs_and_rounded_times(written, make_training):
@@ -225,7 +225,7 @@ def test_curve_of_some_seeds_alone_is_told(written, make_training):
 
 def test_runs_of_a_group_that_ran_other_code_are_told(written, make_training):
     page, _ = written(*(make_training(seed, commit=commit) for seed, commit in enumerate(("0123456789", "abcdef0123"))))
-    assert "Group 1: its runs are of different versions of armscan: 01234567, abcdef01." in page
+    assert "Group 1: its runs used different versions of armscan: 01234567, abcdef01." in page
     assert "differ by nothing but the seed, except for armscan's version." in page
     page, _ = written(make_training(0, commit="0123456789"), make_training(1, commit=None))
     assert "versions of armscan" not in page

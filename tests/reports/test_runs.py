@@ -128,7 +128,7 @@ def test_a_run_that_has_not_finished_takes_part_with_what_it_has(answer, runs, t
         assert answer(f"--runs={','.join(ids)}", "--out=here")[0] == 0
     finally:
         runs.client.update_run(ids[2], status="FINISHED")
-    assert f"Not run to the end, and here with what they have: {ids[2][:8]} (group 1, seed 2): running." in page(
+    assert f"Unfinished, and shown with the data so far: {ids[2][:8]} (group 1, seed 2): running." in page(
         tmp_path / "here"
     )
 

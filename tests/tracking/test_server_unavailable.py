@@ -277,7 +277,7 @@ def test_runs_of_a_dead_process_are_ended_and_those_of_a_living_one_are_not(open
     assert (run.info.status, run.data.tags["failure"]) == ("FAILED", "its worker died")
     assert histories(server.uri, dead.run_id) == {"x": [(7, 1.0)]}
     assert client.get_run(alive.run_id).info.status == "RUNNING"
-    assert [upload.left for upload in sync(tmp_path, lambda _: store)] == ["it is still going on"]
+    assert [upload.left for upload in sync(tmp_path, lambda _: store)] == ["it is still in progress"]
     alive.end("FINISHED")
 
 

@@ -380,7 +380,7 @@ def test_find_run_takes_the_beginning_of_an_id_and_names_what_is_wrong(store):
     for nonsense in ("", "%", "' OR 1=1", "XYZ", 33 * "a"):
         with pytest.raises(TrackingError, match="but it must be an ID as MLflow shows it"):
             find_run(client, nonsense)
-    with pytest.raises(TrackingError, match=r"no run of sqlite:.* has an ID that begins so"):
+    with pytest.raises(TrackingError, match=r"no run of sqlite:.* has an ID that begins with it"):
         find_run(client, 32 * "a")
 
 
