@@ -49,7 +49,7 @@ class CompiledSAC(sac.SAC[Any]):
     Args:
         compute: Device and precision of the tensors.
         replay: Replay buffer to learn from.
-        arguments: Keyword arguments of Tianshou's SAC.
+        **arguments: Keyword arguments of Tianshou's SAC.
 
     Attributes:
         fallback_reason: Reason why Tianshou's own update runs; None if the update is compiled.

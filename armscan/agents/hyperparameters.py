@@ -94,7 +94,7 @@ def check_collection(n_asked: int, num_envs: int, setup: AgentSetup, *, learning
         n_asked: Requested number of environment steps.
         num_envs: Number of environments, each of which takes the same number of steps.
         setup: Training environments, observation space, action names, budget in environment steps, seed and compute.
-        learning_starts: Number of environment steps before the first collection.
+        learning_starts: Number of environment steps before the first collection. Default: 0.
 
     Raises:
         InvalidValueError: If the training has fewer steps.

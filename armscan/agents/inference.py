@@ -53,10 +53,10 @@ class Inference:
     """Chooses an actor's actions in evaluations, for the episodes that `begin` has begun.
 
     Args:
-        actor: Actor that returns mean and spread of the actions, with its current weights.
+        actor: Actor that returns mean and standard deviation of the actions, with its current weights.
         bounded: Function that maps an action to [-1, 1].
         compute: Device and precision of the actor.
-        is_sampling: Whether actions are drawn from mean and spread; all draws of an episode come from its own seed.
+        is_sampling: Whether actions are sampled; all draws of an episode come from its own seed. Default: False.
     """
 
     def __init__(self, actor: nn.Module, bounded: Bounded, compute: Compute, *, is_sampling: bool = False) -> None:
@@ -96,10 +96,10 @@ class Inference:
 
     def _action_of_one(self, observation: Observed, episode: int) -> torch.Tensor:
         """Return the action for one observation, shape (n_action,)."""
-        (means, spreads), _ = self._actor(batch_of([observation]))
-        mean, spread = means[0], spreads[0]
+        (means, stds), _ = self._actor(batch_of([observation]))
+        mean, std = means[0], stds[0]
         if self._is_sampling:
-            mean = mean + spread * torch.randn(mean.shape, generator=self._generators[episode]).to(mean.device)
+            mean = mean + std * torch.randn(mean.shape, generator=self._generators[episode]).to(mean.device)
         return self._bounded(mean)
 
 

@@ -30,9 +30,9 @@ class Multimodal:
     network of Mnih et al. 2015 (doi:10.1038/nature14236).
 
     Args:
-        filters: Number of filters of each convolution.
-        vector_sizes: Units of each layer for the vectors.
-        head_sizes: Units of each hidden layer of the head.
+        filters: Number of filters of each convolution. Default: (32, 64, 64).
+        vector_sizes: Units of each layer for the vectors. Default: (512, 512).
+        head_sizes: Units of each hidden layer of the head. Default: (512, 512).
 
     Raises:
         InvalidValueError: If `filters` is not three whole numbers from 1 to 4096, or another list is empty or holds

@@ -54,8 +54,8 @@ class MLP:
     """Fully connected layers, for flat observations.
 
     Args:
-        hidden_sizes: Units of each hidden layer.
-        activation: Name of the `torch.nn` layer after each hidden layer.
+        hidden_sizes: Units of each hidden layer, each from 1 to 16,384. Default: (64, 64).
+        activation: Activation after each hidden layer: `relu`, `tanh`, `elu` or `gelu`. Default: `relu`.
 
     Raises:
         InvalidValueError: If a size is not a whole number from 1 to 16,384, or the activation is unknown.

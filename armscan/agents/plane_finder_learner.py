@@ -121,9 +121,9 @@ class PlaneFinderLearner(SupervisedLearner):
         """Return the next looks beside the planes found so far, some of them perturbed, as actions that never stop."""
         n = self._envs.num_envs
         draws = torch.as_tensor(rng.normal(size=(n, 4)), dtype=torch.float32, device=self._device)
-        spreads = np.exp([rng.uniform(math.log(low), math.log(high), n) for low, high in (PERTURBED_DEG, PERTURBED_MM)])
+        stds = np.exp([rng.uniform(math.log(low), math.log(high), n) for low, high in (PERTURBED_DEG, PERTURBED_MM)])
         is_perturbed = rng.random(n) < self._finder.perturbed_share
-        perturbed_deg, perturbed_mm = torch.as_tensor(spreads * is_perturbed, dtype=torch.float32, device=self._device)
+        perturbed_deg, perturbed_mm = torch.as_tensor(stds * is_perturbed, dtype=torch.float32, device=self._device)
         with torch.no_grad():
             plane, place, *_ = self._module.estimate(seen)
             tilt = torch.deg2rad(perturbed_deg)[:, None] * draws[:, :2]

@@ -25,10 +25,10 @@ class Policy(nn.Module):
     A deterministic action is the mean of the actor's Gaussian, squashed (SAC) or clipped (PPO) to [-1, 1].
 
     Args:
-        actor: Actor that returns mean and spread of the actions.
+        actor: Actor that returns mean and standard deviation of the actions.
         bounded: Function that maps the mean to [-1, 1], as the learner does when it acts.
         compute: Device and precision of the learner.
-        is_sampling: Whether the learner draws its actions from mean and spread, in evaluations too.
+        is_sampling: Whether the learner samples its actions in evaluations, too. Default: False.
     """
 
     def __init__(

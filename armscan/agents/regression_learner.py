@@ -22,9 +22,9 @@ from armscan.envs.rules import Observed
 from armscan.envs.vector_env import reset_each
 from armscan.utils.arrays import FloatArray
 
-# Logarithms of the spread of normalised actions: 10 ** -2.5 is half a millimetre along an arm of 300 mm, or a third of
-# a degree.
-LOG_SPREADS = (-2.5, -0.5)
+# Range of the decimal logarithm of normalised actions' standard deviations: 10 ** -2.5 is half a millimetre along an
+# arm of 300 mm, or a third of a degree.
+LOG10_STDS = (-2.5, -0.5)
 
 
 class RegressionLearner(SupervisedLearner):
@@ -93,7 +93,7 @@ class RegressionLearner(SupervisedLearner):
         return observations
 
     def _next_planes(self, observations: Observed, rng: np.random.Generator) -> FloatArray:
-        """Draw planes at random, or near the network's choices with log-uniform spreads; shape (n, n_action)."""
+        """Draw planes at random, or near the network's choices with log-uniform deviations; shape (n, n_action)."""
         planes = rng.uniform(-1.0, 1.0, self._envs.action_space.shape or ())
         if not self._own_planes_share:
             return planes
@@ -101,8 +101,8 @@ class RegressionLearner(SupervisedLearner):
             chosen = self._predicted(observations).cpu().numpy()
         if not np.isfinite(chosen).all():
             raise diverged(self._n_env_steps)
-        spread = 10.0 ** rng.uniform(*LOG_SPREADS, (len(planes), 1))
-        near = np.clip(rng.normal(chosen, spread), -1.0, 1.0)
+        std = 10.0 ** rng.uniform(*LOG10_STDS, (len(planes), 1))
+        near = np.clip(rng.normal(chosen, std), -1.0, 1.0)
         return np.where(rng.random((len(planes), 1)) < self._own_planes_share, near, planes)
 
     def _update(self, rng: np.random.Generator) -> torch.Tensor:

@@ -26,7 +26,7 @@ class ResidualModule(nn.Module):
 
     Args:
         finder: Plane finder.
-        actor: Actor that maps features of the plane finder to mean and spread of corrections, shape (n, 4).
+        actor: Actor that maps features of the plane finder to mean and standard deviation of corrections, shape (n, 4).
         limits: Largest corrections in the frame of a look, shape (4,): sines of two tilts, mm along the normal and
             across.
     """

@@ -81,16 +81,16 @@ class StepCollector(Collector[CollectStats]):
         observations: Any = self._pre_collect_obs_RO
         spaces: Any = self.action_space
         ended: list[NDArray[Any]] = []
-        spreads: list[Actions] = []
+        stds: list[Actions] = []
         n_steps = 0
         while n_steps < n_step:
             if random:
                 sent = np.array([space.sample() for space in spaces])
                 actions = self.policy.map_action_inverse(sent)
             else:
-                actions, spread = self._chosen_actions(observations)
+                actions, std = self._chosen_actions(observations)
                 sent = self.policy.map_action(actions)
-                spreads.append(spread)
+                stds.append(std)
             observations, of_ended = self._step(observations, actions, sent)
             ended.append(of_ended)
             n_steps += self.env_num
@@ -103,7 +103,7 @@ class StepCollector(Collector[CollectStats]):
             n_collected_episodes=returns.size,
             returns=returns,
             lens=lengths.astype(int),
-            pred_dist_std_array=np.concatenate(spreads) if spreads else None,
+            pred_dist_std_array=np.concatenate(stds) if stds else None,
         )
 
     @torch.no_grad()
@@ -111,10 +111,10 @@ class StepCollector(Collector[CollectStats]):
         """Return the policy's actions and their standard deviations, each of shape (n_envs, n_action)."""
         policy: Any = self.policy
         is_sac = type(policy) is SACPolicy
-        means_and_spreads = self._means_and_spreads(observations)
+        means_and_stds = self._means_and_stds(observations)
         # Raises an error for NaN, as Tianshou's distributions do.
         chosen_from: Distribution = (
-            Independent(Normal(*means_and_spreads), 1) if is_sac else policy.dist_fn(means_and_spreads)
+            Independent(Normal(*means_and_stds), 1) if is_sac else policy.dist_fn(means_and_stds)
         )
         if policy.deterministic_eval and not policy.is_within_training_step:
             actions = chosen_from.mode
@@ -122,17 +122,17 @@ class StepCollector(Collector[CollectStats]):
             actions = chosen_from.sample()
         return (torch.tanh(actions) if is_sac else actions).cpu().numpy(), chosen_from.stddev.cpu().numpy()
 
-    def _means_and_spreads(self, observations: Observed) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the actor's means and spreads, bit for bit; bypassing its modules takes a third of the time."""
+    def _means_and_stds(self, observations: Observed) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the actor's means and standard deviations; bypassing its modules takes a third of the time."""
         if self._layers is None:
             policy: Any = self.policy
-            means_and_spreads: tuple[torch.Tensor, torch.Tensor] = policy.actor(observations)[0]
-            return means_and_spreads
-        *hidden, mean, spread = ((layer.weight, layer.bias) for layer in self._layers)
+            means_and_stds: tuple[torch.Tensor, torch.Tensor] = policy.actor(observations)[0]
+            return means_and_stds
+        *hidden, mean, std = ((layer.weight, layer.bias) for layer in self._layers)
         features = torch.as_tensor(observations, dtype=torch.float32, device=mean[0].device)
         for weights in hidden:
             features = linear(features, *weights).relu()
-        return linear(features, *mean), linear(features, *spread).clamp(SIGMA_MIN, SIGMA_MAX).exp()
+        return linear(features, *mean), linear(features, *std).clamp(SIGMA_MIN, SIGMA_MAX).exp()
 
     def _step(self, observations: Observed, actions: Actions, sent: Actions) -> tuple[Observed, NDArray[Any]]:
         """Take a step in all environments and store the transitions.

@@ -87,7 +87,7 @@ class TianshouLearner(BaseLearner):
 
     @property
     def actor(self) -> torch.nn.Module:
-        """Actor, from observations to mean and spread of actions."""
+        """Actor, from observations to mean and standard deviation of actions."""
         actor: torch.nn.Module = self._algorithm.policy.actor
         return actor
 

@@ -129,7 +129,7 @@ def test_policy_that_collects_computes_in_the_precision_of_the_updates(phantom):
     observations = learner._collector._pre_collect_obs_RO
     with torch.no_grad():
         of_updates = learner.actor(observations)[0]
-        assert_same_tensors(learner._collector._means_and_spreads(observations), of_updates)
+        assert_same_tensors(learner._collector._means_and_stds(observations), of_updates)
         assert not torch.equal(learner.policy().actor(observations)[0][0], of_updates[0])
 
 
