@@ -5,8 +5,8 @@
 Draws 1,000 planes around the labelled plane of each of 12 phantoms that no reward was fitted to: the slice's centre is
 moved by up to 10 mm along the labelled normal, both angles turned by up to 20 degrees, uniformly. Prints for each
 reward the share of planes that it accepts, that is, that score above -success_threshold, and the median of their
-distances. `its own plane` is not possible for unseen wrists, but the best that the features could do: it is fitted to
-the labelled plane of the very phantom that is judged.
+distances. `its own plane` is fitted to the labelled plane of the phantom that is judged: a bound on what the features
+can do, not possible for unseen wrists.
 """
 
 from __future__ import annotations

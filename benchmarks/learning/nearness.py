@@ -66,7 +66,7 @@ def print_errors(name: str, episodes: Sequence[EpisodeResult]) -> None:
     print_row(name, len(episodes), *figures)
 
 
-def print_doubt(episodes: Sequence[EpisodeResult]) -> None:
+def print_expected_errors(episodes: Sequence[EpisodeResult]) -> None:
     """Print the errors by decile of the expected error, if the episodes have one."""
     for unit in ("mm", "deg"):
         expected = np.array([getattr(each, f"expected_{unit}") for each in episodes], dtype=float)
@@ -98,7 +98,7 @@ def main() -> None:
     print_errors("all", episodes)
     for name in dict.fromkeys(each.volume for each in episodes):
         print_errors(name, [each for each in episodes if each.volume == name])
-    print_doubt(episodes)
+    print_expected_errors(episodes)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
     python -m benchmarks.speed.memory [FOLDER]
 
-What the volumes add is the memory with them minus the memory of the same environments with small volumes. Over a
+The memory that the volumes add is measured against the same environments with small volumes. Over a
 million steps, resets included, the memory of a process should stay as it was after the first tenth.
 """
 

@@ -68,7 +68,7 @@ def main(words: list[str]) -> None:
         worker.join()
     n_bytes = sum(pss for pss, _, _ in reports)
     allowed = 1.3 * n_voxels + n_workers * 700 * 2**20
-    columns = "MiB of voxels", "PSS of all, MiB", "allowed", "s until they are there", "processor s"
+    columns = "MiB of voxels", "PSS of all, MiB", "allowed", "s to load the phantoms", "processor s"
     print_head("workers", "phantoms", *columns)
     slowest, dearest = max(seconds for _, seconds, _ in reports), max(cpu for _, _, cpu in reports)
     figures = (f"{figure / 2**20:.0f}" for figure in (n_voxels, n_bytes, allowed))

@@ -150,7 +150,7 @@ def ways(folder: Path) -> Iterator[dict[str, Callable[[Any], Cost]]]:
     with mlflow_server(folder / "server", f"sqlite:///{folder}/server.db") as server:
         leaving = MlflowServer(folder / "leaving", f"sqlite:///{folder}/leaving.db")
         yield {
-            "nowhere": lambda config: trained(config, None),
+            "untracked": lambda config: trained(config, None),
             "SQLite": lambda config: trained(config, section(f"sqlite:///{folder}/runs.db")),
             "server": lambda config: trained(config, section(server.uri)),
             "server gone": lambda config: away(config, leaving),
@@ -179,8 +179,8 @@ def main() -> None:
             for name, measure in compared.items():
                 costs[name].append(measure(config))
                 print(f"round {number}, {name}: {costs[name][-1]}", flush=True)
-    print(f"\n{'tracked':<12} wall (s)  to nowhere's  calls (s)  threads (s)  at most   longest call (ms)")
-    base = statistics.median(cost.wall_s for cost in costs["nowhere"])
+    print(f"\n{'tracking':<12} wall (s)         ratio  calls (s)  threads (s)  at most   longest call (ms)")
+    base = statistics.median(cost.wall_s for cost in costs["untracked"])
     for name, of_name in costs.items():
         wall, calls, threads, share = (
             statistics.median(getattr(cost, field) for cost in of_name)
