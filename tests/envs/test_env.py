@@ -234,7 +234,7 @@ def test_reset_takes_the_volume_as_an_option(dataset):
         ({"flat": "yes"}, "flat is 'yes'"),
         ({"reward": "best"}, "reward is 'best'"),
         ({"reward": LandmarkReward}, "reward is <class"),
-        ({"reward": LandmarkReward(), "targets": (7, 5, 1)}, "only one of both"),
+        ({"reward": LandmarkReward(), "targets": (7, 5, 1)}, "only one of them"),
         ({"render_mode": "sound"}, "render_mode is 'sound'"),
         ({"volumes": []}, "volumes is empty"),
         ({"volumes": [1]}, "volumes holds 1"),

@@ -112,7 +112,7 @@ def test_only_those_trainings_of_a_pruned_trial_are_cut_off_that_it_was_pruned_i
     for name, words in {"a": study, "b": trial, "c": ",".join(ids)}.items():
         assert answer(f"--runs={words}", f"--out={name}")[0] == 0
         assert [row["status"] for row in rows(tmp_path / name / "runs.csv")] == ["finished", "pruned"]
-        assert f"with what they have: {ids[1][:8]} (group 1, seed 1): pruned." in page(tmp_path / name)
+        assert f"with the data so far: {ids[1][:8]} (group 1, seed 1): pruned." in page(tmp_path / name)
     for each in (study, trial, *ids):
         runs.client.delete_run(each)
 

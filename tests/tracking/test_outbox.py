@@ -79,7 +79,7 @@ def test_outbox_cuts_off_a_line_whose_writer_died(outbox, tmp_path):
 def test_outbox_names_a_damaged_line(outbox, damage):
     with outbox.file.open("ab") as file:
         file.write(damage)
-    with pytest.raises(TrackingError, match=f"{outbox.file}: a line of it is damaged"):
+    with pytest.raises(TrackingError, match=f"{outbox.file}: a line is damaged"):
         list(outbox.entries())
 
 

@@ -294,7 +294,7 @@ def test_sync_goes_on_after_what_it_cannot_upload(opened, server, tmp_path, capf
     (tmp_path / "whole" / "best.pt").write_text("weights")
     assert main(["runs", "sync", str(tmp_path)]) == 1
     told = capfd.readouterr().out
-    assert "a line of it is damaged: b'nonsense" in told
+    assert "a line is damaged: b'nonsense" in told
     assert f"the rest is left: {tmp_path}/elsewhere/best.pt is not there" in told
     assert histories(server.uri, runs[2].run_id) == {"x": [(7, 1.0)]}
     # An outbox that was copied without its files is not taken for uploaded: they may still come.

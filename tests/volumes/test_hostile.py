@@ -105,7 +105,7 @@ def test_an_image_of_more_voxels_than_any_scanner_produces_is_refused(refusal, n
 
 def test_an_image_of_several_values_in_a_voxel_is_refused(refusal):
     several = mha(10, bytes(3000)).replace(b"DimSize", b"ElementNumberOfChannels = 3\nDimSize")
-    assert "ElementNumberOfChannels is 3, but a labelmap has one value in each voxel" in refusal("a.mha", several)
+    assert "ElementNumberOfChannels is 3, but a labelmap has one value per voxel" in refusal("a.mha", several)
 
 
 @pytest.mark.parametrize("name", ["a.mha", "a.nrrd"])

@@ -286,7 +286,7 @@ def test_markups_with_two_planes_are_refused_and_with_other_markups_are_read(tmp
     assert_same_plane(read_markup(path, TINY), ACTION)
     document["markups"].append(document["markups"][1])
     path.write_text(json.dumps(document))
-    with pytest.raises(MarkupError, match=r"\['Fiducial', 'Plane', 'Plane'\], but it must be 'Plane' of exactly one"):
+    with pytest.raises(MarkupError, match=r"\['Fiducial', 'Plane', 'Plane'\], but it must be 'Plane' for exactly one"):
         read_markup(path, TINY)
 
 
