@@ -151,7 +151,9 @@ def _recorded(
     if read_with is not None:
         changed = [name for name in recorded if _reading_of(manifest, name) != _reading_of(read_with, name)]
         if changed:
-            raise ManifestError(f"{path}: its settings for {few(changed)} have changed since; search the plane again")
+            raise ManifestError(
+                f"{path}: its settings for {few(changed)} have changed since; search for the plane again"
+            )
     entries = document.get("volumes")
     entries = {name: {} for name in files} if entries is None else entries
     entries = {**entries, **{name: {**entries.get(name, {}), **keys} for name, keys in recorded.items()}}

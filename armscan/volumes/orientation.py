@@ -34,7 +34,7 @@ def check_orientation(value: Any) -> str | None:
     if not is_code or any(sum(letter in pair for letter in value) != 1 for pair in WORLD_AXES):
         raise InvalidValueError(
             f"orientation is {value!r}, but it must be null (as in the file) or three letters, one of R and L, one of "
-            "A and P, one of S and I: where the file's first, second and third axis run to"
+            "A and P, one of S and I: the directions of the file's first, second and third axis"
         )
     return str(value)
 
