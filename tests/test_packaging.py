@@ -155,6 +155,7 @@ def test_wheel_composes_and_plans_in_an_empty_folder(python, tmp_path):
 
 
 @pytest.mark.full
+@pytest.mark.slow
 def test_wheel_trains_a_grid_in_an_empty_folder(python, tmp_path):
     few = [*(word for word in SMALL if not word.startswith("network")), "training.env_steps=200"]
     # One after the other: the second finds what the first has compiled.

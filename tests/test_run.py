@@ -9,11 +9,13 @@ from collections import Counter
 from pathlib import Path
 
 import mlflow.pyfunc
+import psutil
 import pytest
 import torch
 from mlflow import MlflowClient
 
 from armscan.utils.files import sha256
+from armscan.utils.run_files import folder_lock
 from tests.support import FEW_VOLUMES, REPOSITORY
 from tests.support.processes import COMMAND, start_run
 from tests.support.waiting import HANG_S, wait_until
@@ -424,6 +426,30 @@ def test_job_that_is_ended_takes_no_other_with_it(tmp_path, ending, line, of_gri
     assert "resume all with: " in output
     assert "Traceback" not in output
     assert sorted(each.info.status for each in runs_in(tmp_path)[1]) == of_grid
+
+
+@pytest.mark.full
+def test_jobs_of_a_killed_launcher_end_and_go_on_in_their_runs(tmp_path):
+    words = ["-m", "seed=0,1", "hydra.launcher.n_jobs=2", *SMALL, "training.env_steps=20000"]
+    process = start_run(*words, "training.eval_every_env_steps=1000", cwd=tmp_path)
+
+    def checkpoints():
+        return list((tmp_path / "multirun").glob("*/*/*/last.pt"))
+
+    wait_until(lambda: len(checkpoints()) == 2, process=process, log=(tmp_path / "printed").read_text)
+    jobs = job_process_ids(process.pid)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait(HANG_S)
+    wait_until(lambda: not any(map(psutil.pid_exists, jobs)))
+    (grid,) = [each for each in runs_in(tmp_path)[1] if each.info.run_name.startswith("grid")]
+    # As if the job were still in progress.
+    with folder_lock(checkpoints()[0].parent):
+        again = armscan_run(f"resume={grid.info.run_id}", "--trust", cwd=tmp_path)
+    assert again.returncode == 1, again.stderr
+    assert "failed: " in again.stderr
+    assert again.stderr.count("another process is using this folder") == again.stderr.count("failed: ")
+    assert again.stdout.count("resuming ") == 1
+    assert len(runs_in(tmp_path)[1]) == 4, "no run is begun anew"
 
 
 def job_process_ids(launcher_pid):

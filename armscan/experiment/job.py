@@ -21,6 +21,7 @@ from armscan.config.command_hints import kept_command
 from armscan.config.defaults import CHOICES
 from armscan.errors import FolderInUseError, FolderTakenError, InvalidValueError
 from armscan.utils.files import atomic_write, sha256
+from armscan.utils.processes import ProcessInfo
 from armscan.utils.run_files import CONFIG_FILE, LOCK_FILE, OUTBOX_FOLDER, OUTBOX_SUFFIXES, RUN_ID_PATTERN
 
 PARENT_FILE = "parent_run.json"
@@ -57,6 +58,8 @@ class Job:
         folder: Folder of the grid.
         repeats: MLflow run ID of the grid that is repeated without its finished jobs. Default: None, a new grid.
         is_trusted: Whether it may build any class; false if its words were stored and not trusted. Default: True.
+        launcher: Process of the grid's launcher, with which the job ends. Default: None, it goes on without it, as on a
+            cluster.
     """
 
     number: int
@@ -66,6 +69,7 @@ class Job:
     folder: Path
     repeats: str | None = None
     is_trusted: bool = True
+    launcher: ProcessInfo | None = None
 
     @classmethod
     def current(cls) -> Self | None:
@@ -78,8 +82,9 @@ class Job:
         overrides = list(hydra_config.overrides.task)
         varied = [override for override in overrides if override not in parent["common"]]
         words = shlex.join(overrides), " ".join(varied)
+        launcher = ProcessInfo.of(parent["launcher"]) if parent["launcher"] else None
         repeated = parent["repeats"], parent["is_trusted"]
-        return cls(hydra_config.job.num, *words, parent["run_id"], folder, *repeated)
+        return cls(hydra_config.job.num, *words, parent["run_id"], folder, *repeated, launcher)
 
     @property
     def label(self) -> str:

@@ -8,14 +8,14 @@ import signal
 import subprocess
 import sys
 import traceback
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 from omegaconf import DictConfig
 
 from armscan.config.error_messages import one_line_message
 from armscan.experiment.job import INTERRUPTED, NO_OUTCOME, Invocation, Job, remove_if_untracked
-from armscan.utils.processes import child_command, on_parent_exit
+from armscan.utils.processes import ProcessInfo, child_command, on_exit, on_parent_exit
 
 ENDINGS = (signal.SIGINT, signal.SIGTERM)
 
@@ -25,6 +25,8 @@ def start_job(config: DictConfig, invocation: Invocation, job: Job) -> None:
 
     If it is killed, for example out of memory, the launcher and the other jobs continue.
     """
+    if job.launcher is not None and not job.launcher.is_current:
+        _end_with(job.launcher)
     if not job.claims(invocation.folder):
         failure = f"its folder, {invocation.folder}, is another job's: hydra.sweep.subdir must differ between jobs"
         job.write_outcome(failure=failure)
@@ -37,6 +39,12 @@ def start_job(config: DictConfig, invocation: Invocation, job: Job) -> None:
         killed_by = signal.Signals(-ended.returncode)
         question = ": out of memory?" if killed_by == signal.SIGKILL else ""
         job.write_outcome(failure=f"killed by {killed_by.name}{question}")
+
+
+@cache
+def _end_with(launcher: ProcessInfo) -> None:
+    """End this process, and so its job, once the grid's launcher has been killed: Joblib's workers would stay."""
+    on_exit(launcher, partial(os._exit, 1))
 
 
 def run_job(launcher_pid: int) -> None:

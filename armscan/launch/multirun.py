@@ -6,7 +6,7 @@ import json
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,10 +30,11 @@ from armscan.experiment.job import (
     JobOutcome,
     remove_run_folder,
 )
-from armscan.launch.launchers import LAUNCHER, check_launcher, prepare_launcher
+from armscan.launch.launchers import LAUNCHER, ON_THIS_MACHINE, check_launcher, prepare_launcher
 from armscan.tracking import TrackingStore, begin_outbox, code_state, note_end, open_store, sync
 from armscan.tracking.sync import PROCESS_DIED
 from armscan.tracking.tags import CONTINUED_TAG, FAILURE_TAG, FOLDER_TAG, GRID_TAG, JOB_TAG
+from armscan.utils.processes import ProcessInfo
 from armscan.utils.run_files import LAST_CHECKPOINT, RESULTS_PAGE
 
 if TYPE_CHECKING:
@@ -107,6 +108,7 @@ class Multirun(Callback):
             client.set_tag(Multirun.repeats, CONTINUED_TAG, run.info.run_id)
         parent = {"run_id": run.info.run_id, "tracking": tracking, "overrides": overrides, "common": _common(overrides)}
         parent |= {"repeats": Multirun.repeats, "is_trusted": Multirun.is_trusted}
+        parent |= {"launcher": asdict(ProcessInfo.current()) if launcher in ON_THIS_MACHINE else None}
         # Also if it was resumed with --trust.
         is_told = Multirun.repeats is not None and Multirun.is_trusted
         parent |= {"trust": is_told or untrusted_word(again, tracking["uri"]) is not None}

@@ -28,7 +28,7 @@ from armscan.tracking import TrackingStore, load_run, open_store
 from armscan.tracking.sanitize import params_of
 from armscan.tracking.tags import FOLDER_TAG, GRID_TAG, JOB_TAG, PARENT_TAG, STUDY_TAG
 from armscan.training import Fingerprints, check_unchanged
-from armscan.utils.run_files import LAST_CHECKPOINT
+from armscan.utils.run_files import LAST_CHECKPOINT, folder_lock
 
 if TYPE_CHECKING:
     from mlflow.entities import Run
@@ -54,6 +54,11 @@ def run_again(config: DictConfig, invocation: Invocation, job: Job) -> Metrics:
             return _metrics_of(run)
     for run in earlier:
         folder = run.data.tags.get(FOLDER_TAG)
+        is_of_grid = run.data.tags.get(PARENT_TAG) == job.repeats
+        if is_of_grid and run.info.status == "RUNNING" and folder is not None and Path(folder).is_dir():
+            # Raises if the run is in progress, as after its launcher was killed: it would be trained twice.
+            with folder_lock(Path(folder)):
+                pass
         if run.info.status != "RUNNING" and folder is not None and (Path(folder) / LAST_CHECKPOINT).exists():
             _set_parent(client, run, job)
             # Trusted, because its configuration is this job's.

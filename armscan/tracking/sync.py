@@ -79,7 +79,8 @@ def _synced(files: Iterable[Path], opened: Callable[[str], TrackingStore], *, tr
         try:
             with contextlib.closing(Outbox(file, timeout_s=0.0)) as outbox:
                 run_id, uri = outbox.address.run_id, outbox.address.uri
-                is_open = outbox.status not in ENDED and (note := _note_of(file)) is not None and note.is_dead
+                is_dead = (note := _note_of(file)) is not None and note.is_dead
+                is_open = is_dead and outbox.status not in ENDED and not _is_tracked_beside(file)
                 if outbox.is_uploaded and not is_open:
                     continue
                 if isinstance(store := stores.get(uri) or _opened(opened, uri), TrackingError):
@@ -102,6 +103,20 @@ def _note_of(file: Path) -> Note | None:
     """Return this machine's note of the run with this outbox; None if there is none, or it is of another outbox."""
     note = Note.of(file.stem)
     return note if note is not None and note.outbox.resolve() == file.resolve() else None
+
+
+def _is_tracked_beside(file: Path) -> bool:
+    """Return whether another process tracks the run of an outbox, as several commands of a study do."""
+    file = file.resolve()
+    found = {each.resolve() for each in file.parents[2].glob(f"*/{file.parent.name}/{file.name}")}
+    for other in found - {file}:
+        try:
+            Outbox(other, timeout_s=0.0).close()
+        except FolderInUseError:
+            return True
+        except (OSError, TrackingError):
+            continue
+    return False
 
 
 def _end_removed(run_id: str, note: Note, opened: Callable[[str], TrackingStore]) -> str | None:
@@ -194,7 +209,8 @@ def _upload_pending(store: TrackingStore) -> None:
         # be local to that machine. A process of an earlier boot has ended; an earlier version noted no process.
         process = note.process
         has_ended = not process.host or (process.host == here.host and process.boot != here.boot)
-        if all(each.left is None for each in uploads) and (is_there or has_ended):
+        is_over = (is_there or has_ended) and not _is_tracked_beside(note.outbox)
+        if is_over and all(each.left is None for each in uploads):
             forget(run_id)
 
 

@@ -180,9 +180,17 @@ def on_parent_exit(parent_pid: int, action: Callable[[], object]) -> None:
         parent_pid: ID of the parent, as `child_command` passes it: it may have ended during this process's imports.
         action: Function to call.
     """
+    _when_false(lambda: os.getppid() == parent_pid, action)
 
+
+def on_exit(process: ProcessInfo, action: Callable[[], object]) -> None:
+    """Call `action` in a thread once a process has ended; never if it cannot be seen from here."""
+    _when_false(lambda: process.is_alive, action)
+
+
+def _when_false(condition: Callable[[], bool], action: Callable[[], object]) -> None:
     def watch() -> None:
-        while os.getppid() == parent_pid:
+        while condition():
             time.sleep(POLL_S)
         action()
 

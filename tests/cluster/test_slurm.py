@@ -64,6 +64,7 @@ def test_study_goes_on_when_the_launcher_gives_up_for_one_job_that_was_killed(cl
     assert "waiting for workers that are still there" in printed
 
 
+@pytest.mark.slow
 def test_jobs_that_are_to_end_hand_their_trials_back_and_go_on_with_them_when_they_are_queued_again(cluster, start):
     words = ["study.n_trials=2", "study.final_eval.top_k=0", "training.env_steps=10000"]
     study = start(*TRAINING, *SLURM, *words, environment=cluster.environment)

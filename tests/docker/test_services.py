@@ -116,6 +116,7 @@ def test_postgres_understands_its_words_and_says_when_it_is_unavailable(containe
     assert not containers.is_healthy("postgres")
 
 
+@pytest.mark.slow
 def test_study_on_the_services_is_stopped_and_gone_on_with(containers, postgres_there):
     for name in ("mlflow", "dashboard"):
         assert not containers.is_healthy(name)

@@ -72,6 +72,21 @@ def test_run_that_was_killed_is_ended_by_the_next_process(uri, run_id, tmp_path,
     assert ending_of(uri, run_id) == ("FAILED", FOLDER_REMOVED if is_removed else PROCESS_DIED)
 
 
+@pytest.mark.parametrize("who", ["a start", "runs sync"])
+def test_run_that_another_process_tracks_beside_the_dead_one_is_not_ended(uri, run_id, tmp_path, who):
+    def look():
+        if who == "a start":
+            _upload_pending(open_existing_store(uri))
+        else:
+            sync(tmp_path, open_existing_store)
+        return ending_of(uri, run_id)
+
+    shutil.copytree(tmp_path / "run", tmp_path / "beside")
+    with contextlib.closing(Outbox(file_of(tmp_path / "beside", run_id))):
+        assert look() == ("RUNNING", None)
+    assert look() == ("FAILED", PROCESS_DIED)
+
+
 def test_end_that_the_store_has_already_stays(uri, run_id, tmp_path):
     store = open_existing_store(uri)
     store.set_tag(run_id, "failure", "interrupted")

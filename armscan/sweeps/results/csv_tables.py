@@ -59,6 +59,8 @@ def all_numbers(
         "reports": [
             {"trial": trial.number, "step": step, "objective": name, "value": value}
             for trial in trials
+            # Its retry has its reports.
+            if not was_retried(trial)
             for step, values in reports_of(trial).items()
             for name, value in zip(objectives, values, strict=True)
         ],

@@ -105,7 +105,9 @@ def _spans_of(trial: FrozenTrial) -> Iterator[tuple[float, float]]:
     """Yield the start and end of each time that a trial ran, also before it was requeued, in seconds since 1970."""
     yield from map(tuple, trial.user_attrs.get(EARLIER_SPANS, ()))
     if trial.datetime_start:
-        yield trial.datetime_start.timestamp(), _last_seen_s(trial)
+        start_s = trial.datetime_start.timestamp()
+        # The first heartbeat comes just before.
+        yield start_s, max(start_s, _last_seen_s(trial))
 
 
 def _last_seen_s(trial: FrozenTrial) -> float:

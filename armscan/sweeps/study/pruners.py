@@ -1,18 +1,30 @@
-"""Pruner of trials with several objectives, which Optuna's own refuse."""
+"""Pruners that compare trials at rungs: of one objective, and of several, which Optuna's own refuse."""
 
 from __future__ import annotations
+
+from collections.abc import Container
+from typing import Any, cast
 
 import numpy as np
 import optuna
 from numpy.typing import NDArray
-from optuna.pruners import BasePruner
+from optuna.pruners import BasePruner, SuccessiveHalvingPruner
 from optuna.trial import FrozenTrial, TrialState
 
 from armscan.sweeps.scheduling.state import loss_signs
+from armscan.sweeps.storage.attribute_names import RETRIED
 from armscan.sweeps.storage.reports import reports_of
 from armscan.utils.validation import check_int
 
 Losses = NDArray[np.float64]
+
+
+class HalvingPruner(SuccessiveHalvingPruner):
+    """Optuna's asynchronous successive halving, which counts a trial once, however often it was retried."""
+
+    def prune(self, study: optuna.Study, trial: FrozenTrial) -> bool:
+        """Return whether to prune a trial; see `SuccessiveHalvingPruner.prune`."""
+        return super().prune(cast(optuna.Study, _WithoutRetried(study)), trial)
 
 
 class ParetoPruner(BasePruner):
@@ -42,7 +54,8 @@ class ParetoPruner(BasePruner):
         rung = self._rung_below(steps[-1]) if steps else None
         if rung is None or any(step >= rung for step in steps[:-1]):
             return False
-        reached = [_values_at(rung, each) for each in study.get_trials(deepcopy=False) if each.number != trial.number]
+        others = [each for each in _WithoutRetried(study).get_trials() if each.number != trial.number]
+        reached = [_values_at(rung, each) for each in others]
         values = [_values_at(rung, trial), *filter(None, reached)]
         losses = np.array(values, dtype=float) * loss_signs(study.directions)
         # An unknown value counts as worst.
@@ -57,6 +70,20 @@ class ParetoPruner(BasePruner):
         while (following := rung * self._reduction_factor) <= step:
             rung = following
         return rung
+
+
+class _WithoutRetried:
+    """A study without the trials that were retried: their retries have their reports."""
+
+    def __init__(self, study: optuna.Study) -> None:
+        self._study = study
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._study, name)
+
+    def get_trials(self, deepcopy: bool = False, states: Container[TrialState] | None = None) -> list[FrozenTrial]:
+        """Return the trials that count."""
+        return [each for each in self._study.get_trials(deepcopy, states) if RETRIED not in each.user_attrs]
 
 
 def _values_at(rung: int, trial: FrozenTrial) -> tuple[float, ...] | None:

@@ -4,8 +4,9 @@ import optuna
 import pytest
 
 from armscan.stats.bootstrap import Estimate
-from armscan.sweeps.results.csv_tables import _difference_rows, _importance_rows
+from armscan.sweeps.results.csv_tables import _difference_rows, _importance_rows, all_numbers
 from armscan.sweeps.results.judgement import Difference, Judgement
+from armscan.sweeps.storage.attribute_names import OBJECTIVES, RETRIED, RETRY_OF
 
 
 def test_differences_have_the_probability_beside_the_difference():
@@ -15,6 +16,18 @@ def test_differences_have_the_probability_beside_the_difference():
     )
     (row,) = _difference_rows(judgement)
     assert [row[name] for name in ("probability", "probability_low", "probability_high")] == [0.7, 0.5, 0.9]
+
+
+def test_reports_of_a_retried_trial_are_those_of_its_retry_alone():
+    study = optuna.create_study()
+    study.set_user_attr(OBJECTIVES, ["steps"])
+    for attributes in ({RETRIED: True}, {RETRY_OF: 0}):
+        study.enqueue_trial({}, user_attrs=attributes)
+        trial = study.ask()
+        trial.report(3.0, 100)
+        study.tell(trial, 3.0)
+    rows = all_numbers(study, study.trials, found=(), candidates=(), judgement=None)["reports"]
+    assert rows == [{"trial": 1, "step": 100, "objective": "steps", "value": 3.0}]
 
 
 @pytest.mark.parametrize("direction", ["maximize", "minimize"])

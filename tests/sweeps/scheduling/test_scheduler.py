@@ -13,7 +13,7 @@ import pytest
 from optuna.trial import TrialState, create_trial
 
 from armscan.sweeps.scheduling.claim import PendingWrites, PlannedTrial, TrialOutcome
-from armscan.sweeps.scheduling.state import StudyState, retried_by, seconds_of
+from armscan.sweeps.scheduling.state import BEAT_S, StudyState, retried_by, seconds_of
 from armscan.sweeps.storage.attribute_names import (
     ATTEMPT,
     EARLIER_SPANS,
@@ -408,6 +408,14 @@ def test_time_is_counted_rightly_when_clocks_are_put_forward(monkeypatch, hours,
     finally:
         monkeypatch.undo()
         time.tzset()
+
+
+def test_trial_whose_worker_died_before_its_second_heartbeat_took_no_negative_time():
+    trial = create_trial(state=TrialState.RUNNING, user_attrs={LEASE: {BEAT_S: time.time() - 1.0}})
+    trial.datetime_start = datetime.now()
+    assert StudyState.of([trial]).busy_hours == 0.0
+    trial.state, trial.datetime_complete = TrialState.FAIL, trial.datetime_start
+    assert seconds_of(trial) >= 0.0
 
 
 def test_trial_of_another_study_has_taken_no_time_here():

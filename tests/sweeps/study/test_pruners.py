@@ -1,4 +1,4 @@
-"""The pruner of several objectives: fronts and crowding by brute force, and which trials go on."""
+"""Pruners: fronts and crowding by brute force, which trials go on, and that a retried trial counts once."""
 
 import itertools
 import math
@@ -12,10 +12,11 @@ from hypothesis import strategies as st
 from optuna.trial import TrialState
 
 from armscan.errors import InvalidValueError, StudyError
+from armscan.sweeps.storage.attribute_names import RETRIED
 from armscan.sweeps.storage.reports import reports_of, store_report
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.components import read_settings
-from armscan.sweeps.study.pruners import ParetoPruner, crowding_distances, front_numbers, n_better
+from armscan.sweeps.study.pruners import HalvingPruner, ParetoPruner, crowding_distances, front_numbers, n_better
 
 # Few values, so that ties and repeated rows are common.
 LOSSES = arrays.arrays(
@@ -106,6 +107,26 @@ def test_trial_that_ended_before_a_rung_is_compared_by_its_final_values(report):
     for _ in range(2):
         assert report({50: (0.9, 50.0)}, ended=(0.9, 50.0)) is None
     assert report({100: (0.5, 100.0)}) == 100
+
+
+def test_trial_that_was_retried_counts_once(report):
+    report.study.enqueue_trial({}, user_attrs={RETRIED: True})
+    assert [report({100: values}) for values in [(0.9, 5.0)] * 2 + [(0.1, 9.0)] * 2] == [None, None, 100, 100]
+    # The second-best of four; with the retried one it would be the third of five.
+    assert report({100: (0.5, 6.0)}) is None
+
+
+def test_halving_counts_a_retried_trial_once():
+    ends = []
+    for attrs in ({}, {RETRIED: True}):
+        study = optuna.create_study(direction="minimize", pruner=HalvingPruner(min_resource=100, reduction_factor=4))
+        study.enqueue_trial({}, user_attrs=attrs)
+        trials = [study.ask() for _ in range(9)]
+        for trial, value in zip(trials, (1.0, 1.0, *[9.0] * 6, 2.0), strict=True):
+            trial.report(value, 100)
+            ends.append(trial.should_prune())
+    assert ends[8], "two of nine may go on"
+    assert not ends[17], "the second-best of eight"
 
 
 def test_trial_of_unknown_values_is_worst(report):
