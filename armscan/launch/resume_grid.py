@@ -24,7 +24,7 @@ from armscan.experiment.provenance import provenance_files, sha256_tags
 from armscan.experiment.results import LAST_VALIDATION, figures_of
 from armscan.experiment.resume import resume_run
 from armscan.experiment.runner import run_experiment
-from armscan.tracking import TrackingStore, load_run, open_store
+from armscan.tracking import TrackingStore, load_run, open_store, sync
 from armscan.tracking.sanitize import params_of
 from armscan.tracking.tags import FOLDER_TAG, GRID_TAG, JOB_TAG, PARENT_TAG, STUDY_TAG
 from armscan.training import Fingerprints, check_unchanged
@@ -58,7 +58,9 @@ def run_again(config: DictConfig, invocation: Invocation, job: Job) -> Metrics:
         if is_of_grid and run.info.status == "RUNNING" and folder is not None and Path(folder).is_dir():
             # Raises if the run is in progress, as after its launcher was killed: it would be trained twice.
             with folder_lock(Path(folder)):
-                pass
+                # Ends the run if its process has died.
+                sync(Path(folder), lambda _: client)
+            run = client.get_run(run.info.run_id)
         if run.info.status != "RUNNING" and folder is not None and (Path(folder) / LAST_CHECKPOINT).exists():
             _set_parent(client, run, job)
             # Trusted, because its configuration is this job's.
