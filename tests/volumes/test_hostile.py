@@ -159,9 +159,9 @@ def test_nifti_headers_that_would_be_mended_or_printed_about_are_refused(refusal
         ("a.nrrd", nrrd(10, VOXELS, encoding="hex"), "the encoding is 'hex'"),
         ("a.nrrd", nrrd(10, VOXELS, encoding="bzip2"), "the encoding is 'bzip2'"),
         ("a.nrrd", nrrd(10, VOXELS, more="byte skip: -1\n"), "with skips of -1 or 0"),
-        ("a.nrrd", nrrd(10, more="data file: LIST\n"), "there is none of that name"),
+        ("a.nrrd", nrrd(10, more="data file: LIST\n"), "there is no such file"),
         ("a.mha", mha(10, VOXELS).replace(b"BinaryData = True", b"BinaryData = False"), "BinaryData is False"),
-        ("a.mhd", mha(10, b"", file="a.%03d 1 10 1"), "there is none of that name"),
+        ("a.mhd", mha(10, b"", file="a.%03d 1 10 1"), "there is no such file"),
         ("a.mha", mha(10, VOXELS).replace(b"NDims", b"HeaderSize = 5\nNDims"), "HeaderSize is 5"),
         ("a.mha", mha(10, VOXELS + b"1"), "the file is damaged: it holds more than 1000 bytes"),
         (
