@@ -86,7 +86,8 @@ def _on_subjects(groups: Sequence[Group]) -> Iterator[str]:
         played = [episode for each in evaluations_by_seed(group).values() for episode in each.episodes]
         n_subjects[group.number] = len({episode.subject or episode.volume for episode in played})
     if few := [number for number, n in n_subjects.items() if 0 < n < MIN_SUBJECTS]:
-        yield f"{_numbered(few, groups)}: fewer than {MIN_SUBJECTS} test subjects: intervals are too narrow."
+        what = f"fewer than {MIN_SUBJECTS} test subjects: the intervals are too narrow for other subjects"
+        yield f"{_numbered(few, groups)}: {what}."
 
 
 def _on_unfinished(groups: Sequence[Group]) -> Iterator[str]:
