@@ -75,7 +75,7 @@ class PlaneFinderLearner(SupervisedLearner):
         losses: list[Tensor] = []
         while self._n_env_steps < n_env_steps:
             observations, _ = reset_each(self._envs, None if losses else seeds, self._volumes(rng, self._envs.num_envs))
-            losses.append(self._teach(observations, rng))
+            losses.append(self._gradient_step(observations, rng))
             self._n_env_steps += self._env_steps_per_update
         return losses
 
@@ -90,7 +90,7 @@ class PlaneFinderLearner(SupervisedLearner):
         chosen = (rng.random(n_episodes) >= phantom_share).astype(int)
         return {"volume": [groups[each][int(rng.integers(len(groups[each])))] for each in chosen]}
 
-    def _teach(self, observations: Observed, rng: np.random.Generator) -> Tensor:
+    def _gradient_step(self, observations: Observed, rng: np.random.Generator) -> Tensor:
         """Play an episode in every environment, and take a gradient step on its looks."""
         optima = self._optima(self._envs)
         seen = [self._tensors(observations)]

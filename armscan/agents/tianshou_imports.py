@@ -7,7 +7,7 @@ import sys
 from types import ModuleType
 from typing import Any
 
-STAND_INS = {
+STUBS = {
     "matplotlib.figure": "Figure",
     "tianshou.env.pettingzoo_env": "PettingZooEnv",
     "torch.utils.tensorboard": "SummaryWriter",
@@ -17,7 +17,7 @@ STAND_INS = {
 
 
 def import_tianshou() -> None:
-    """Import Tianshou, with an empty class for each name of `STAND_INS`, and without Ray.
+    """Import Tianshou, with an empty class for each name of `STUBS`, and without Ray.
 
     Call it before anything else imports Tianshou; afterwards it does nothing. Tianshou keeps the empty classes, so its
     logger for TensorBoard and its multi-agent environments do not work in this process. Other code that imports these
@@ -25,7 +25,7 @@ def import_tianshou() -> None:
     """
     # None makes the import fail, and Tianshou works without Ray.
     modules: dict[str, Any] = {"ray": None}
-    for name, part in STAND_INS.items():
+    for name, part in STUBS.items():
         modules[name] = ModuleType(name)
         setattr(modules[name], part, type(part, (), {}))
     added = {name: module for name, module in modules.items() if name not in sys.modules}

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from armscan.anatomy import SUCCESS_THRESHOLD, Tissues, check_tissues
 from armscan.envs.actions import COMPONENTS
 from armscan.envs.observations import View
-from armscan.envs.panels import BACKGROUND, INK, LINE_INK, OPTIMUM_INK, PLANE_INK, Ink
+from armscan.envs.panels import BACKGROUND, LINE_COLOUR, OPTIMUM_COLOUR, PLANE_COLOUR, TEXT_COLOUR, Colour
 from armscan.envs.rendering import HEIGHT, WIDTH, Box, ReferencePlane, RewardHistory, draw_plane, view_of
 from armscan.envs.rules import Volumes, named_volumes
 from armscan.envs.scene import reachable_optimum
@@ -137,13 +137,13 @@ class Explorer:
             BOUND_DEG,
             valinit=0.0,
             valfmt="%.1f°" if component in ("rz", "rx") else "%.1f mm",
-            color=_rgb(LINE_INK),
-            track_color=_rgb(LINE_INK),
-            initcolor=_rgb(OPTIMUM_INK),
-            handle_style={"facecolor": _rgb(PLANE_INK), "edgecolor": _rgb(PLANE_INK)},
+            color=_rgb(LINE_COLOUR),
+            track_color=_rgb(LINE_COLOUR),
+            initcolor=_rgb(OPTIMUM_COLOUR),
+            handle_style={"facecolor": _rgb(PLANE_COLOUR), "edgecolor": _rgb(PLANE_COLOUR)},
         )
         for text in (slider.label, slider.valtext):
-            text.set_color(_rgb(INK))
+            text.set_color(_rgb(TEXT_COLOUR))
         # Drawn together with the picture.
         slider.drawon = False
         slider.on_changed(self._look)
@@ -152,8 +152,8 @@ class Explorer:
     def _button(self, row: int, action: Callable[[], None], label: str = "") -> Button:
         left, bottom, width, height = BUTTONS_AT
         axes = self._axes((left, bottom - row * BUTTON_GAP, width, height))
-        button = Button(axes, label, color=_rgb(LINE_INK), hovercolor=_rgb((92, 100, 118)))
-        button.label.set_color(_rgb(INK))
+        button = Button(axes, label, color=_rgb(LINE_COLOUR), hovercolor=_rgb((92, 100, 118)))
+        button.label.set_color(_rgb(TEXT_COLOUR))
         button.on_clicked(lambda _: action())
         return button
 
@@ -204,7 +204,7 @@ def _named(volumes: LabelVolume | Volumes) -> dict[str, LabelVolume]:
     return named_volumes(volumes)
 
 
-def _rgb(ink: Ink) -> tuple[float, float, float]:
+def _rgb(colour: Colour) -> tuple[float, float, float]:
     """Return a colour in Matplotlib's form."""
-    red, green, blue = (part / 255 for part in ink)
+    red, green, blue = (part / 255 for part in colour)
     return red, green, blue

@@ -19,28 +19,30 @@ from armscan.volumes.rigid_transform import RigidTransform
 from armscan.volumes.volume import LabelVolume
 
 BACKGROUND = (18, 20, 26)
-INK = (226, 230, 238)
-FAINT_INK = (140, 148, 162)
-LINE_INK = (62, 68, 82)
-PLANE_INK = (255, 214, 64)
-OPTIMUM_INK = (96, 222, 255)
-REWARD_INK = (255, 150, 80)
+TEXT_COLOUR = (226, 230, 238)
+FAINT_COLOUR = (140, 148, 162)
+LINE_COLOUR = (62, 68, 82)
+PLANE_COLOUR = (255, 214, 64)
+OPTIMUM_COLOUR = (96, 222, 255)
+REWARD_COLOUR = (255, 150, 80)
 # Background, bones, tendons, artery, nerve.
-TISSUE_INKS = np.array([(34, 38, 48), (224, 214, 190), (72, 178, 118), (226, 74, 70), (168, 138, 220)], dtype=np.uint8)
+TISSUE_COLOURS = np.array(
+    [(34, 38, 48), (224, 214, 190), (72, 178, 118), (226, 74, 70), (168, 138, 220)], dtype=np.uint8
+)
 # Shades of the tissue's colour for clusters 1, 2, 3, 4, repeated for further ones.
 SHADES = (1.0, 0.84, 0.92, 0.76)
 UNCLUSTERED = 0.45
-OUTLINE_INK = (255, 255, 255)
-NUMBER_INK = (12, 14, 18)
+OUTLINE_COLOUR = (255, 255, 255)
+NUMBER_COLOUR = (12, 14, 18)
 # In pixels of the picture: a smaller cluster would be hidden under its number.
 MIN_NUMBERED = 300
 
-Inks = NDArray[np.uint8]
+ColourImage = NDArray[np.uint8]
 Pixel = TypeVar("Pixel", bound=np.generic)
-Ink = tuple[int, int, int]
+Colour = tuple[int, int, int]
 Size = tuple[int, int]
 # Views from the palm, (along, across, 3), and the side, (along, depth, 3): drawn once per volume, and freed with it.
-_SIDES: WeakKeyDictionary[LabelVolume, tuple[Inks, Inks]] = WeakKeyDictionary()
+_SIDES: WeakKeyDictionary[LabelVolume, tuple[ColourImage, ColourImage]] = WeakKeyDictionary()
 
 
 @lru_cache
@@ -49,42 +51,42 @@ def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     return ImageFont.load_default(size)
 
 
-def slice_panel(view: View, room: Size) -> Image.Image:
+def slice_panel(view: View, max_size: Size) -> Image.Image:
     """Draw a slice, palm up: each cluster outlined, numbered, and in a shade of its tissue's colour.
 
     Pixels of a landmark that belong to no cluster are darker.
 
     Args:
         view: Slice to draw, with its clusters.
-        room: Size (width, height) in pixels that the picture fits into; its aspect ratio is kept.
+        max_size: Size (width, height) in pixels that the picture fits into; its aspect ratio is kept.
     """
     # Cluster number of each pixel, 0 if it has none; no pixel is of two tissues.
     numbers = np.sum([tissue.image for tissue in view.clusters.each()], axis=0)
     (n_across, n_depth), (across_mm, depth_mm) = view.geometry.shape, view.geometry.pixel_mm
     size_mm = n_across * across_mm, n_depth * depth_mm
-    size = _size(size_mm, _scale(size_mm, room))
+    size = _size(size_mm, _scale(size_mm, max_size))
     # Rows of the picture run from the palm, at high z, to the back of the hand.
-    inks = _resized(_slice_inks(view, numbers).transpose(1, 0, 2)[::-1], size)
+    colours = _resized(_slice_colours(view, numbers).transpose(1, 0, 2)[::-1], size)
     codes = np.where(numbers > 0, view.slice_xz * np.int32(numbers.max() + 1) + numbers, 0)
-    inks[_outlines(_resized(codes.T[::-1], size))] = OUTLINE_INK
-    picture = Image.fromarray(inks)
+    colours[_outlines(_resized(codes.T[::-1], size))] = OUTLINE_COLOUR
+    picture = Image.fromarray(colours)
     draw = ImageDraw.Draw(picture)
     scale = np.divide(size, (n_across, n_depth))
     for tissue in view.clusters.each():
         for number, ((across, depth), n_pixels) in enumerate(zip(tissue.centres, tissue.sizes, strict=True), 1):
             if n_pixels * scale.prod() >= MIN_NUMBERED:
                 middle = (across + 0.5) * scale[0], (n_depth - depth - 0.5) * scale[1]
-                draw.text(middle, str(number), fill=NUMBER_INK, font=font(13), anchor="mm")
+                draw.text(middle, str(number), fill=NUMBER_COLOUR, font=font(13), anchor="mm")
     return picture
 
 
-def _slice_inks(view: View, numbers: NDArray[np.int32]) -> Inks:
+def _slice_colours(view: View, numbers: NDArray[np.int32]) -> ColourImage:
     """Return the colours of a slice, shape (across, depth, 3)."""
-    inks = TISSUE_INKS[view.slice_xz]
+    colours = TISSUE_COLOURS[view.slice_xz]
     shades = np.where(numbers > 0, np.array(SHADES)[(numbers - 1) % len(SHADES)], UNCLUSTERED)
     is_landmark = np.isin(view.slice_xz, LANDMARK_LABELS)
-    inks[is_landmark] = (inks[is_landmark] * shades[is_landmark, None]).astype(np.uint8)
-    return inks
+    colours[is_landmark] = (colours[is_landmark] * shades[is_landmark, None]).astype(np.uint8)
+    return colours
 
 
 def _outlines(codes: NDArray[np.int32]) -> NDArray[np.bool_]:
@@ -104,8 +106,8 @@ def is_right_handed(volume: LabelVolume) -> bool:
 def side_panels(
     volume: LabelVolume,
     transform: RigidTransform | None,
-    planes: Sequence[tuple[ManipulatorAction, Ink, int]],
-    rooms: tuple[Size, Size],
+    planes: Sequence[tuple[ManipulatorAction, Colour, int]],
+    max_sizes: tuple[Size, Size],
 ) -> tuple[Image.Image, Image.Image]:
     """Draw the unmoved volume from the palm (frontal) and from the side (sagittal), fingers up, at one scale.
 
@@ -116,28 +118,28 @@ def side_panels(
         transform: Motion of the volume in the episode; None: no motion.
         planes: Planes to outline, in the frame of the moved volume, each with its colour and its line width in pixels;
             the last one is on top.
-        rooms: Size (width, height) in pixels that each picture fits into; its aspect ratio is kept.
+        max_sizes: Size (width, height) in pixels that each picture fits into; its aspect ratio is kept.
     """
     is_flipped = is_right_handed(volume)
     if volume not in _SIDES:
         labels = volume.labels[::-1] if is_flipped else volume.labels
         from_palm, from_side = _first_seen(labels[:, :, ::-1], 2), _first_seen(labels, 0)
-        _SIDES[volume] = TISSUE_INKS[from_palm.T], TISSUE_INKS[from_side]
+        _SIDES[volume] = TISSUE_COLOURS[from_palm.T], TISSUE_COLOURS[from_side]
     across_mm, along_mm, depth_mm = volume.size_mm
     sizes_mm = (across_mm, along_mm), (depth_mm, along_mm)
-    scale = min(_scale(size_mm, room) for size_mm, room in zip(sizes_mm, rooms, strict=True))
+    scale = min(_scale(size_mm, max_size) for size_mm, max_size in zip(sizes_mm, max_sizes, strict=True))
     frontal, sagittal = (
-        Image.fromarray(_resized(inks, _size(size_mm, scale)))
-        for inks, size_mm in zip(_SIDES[volume], sizes_mm, strict=True)
+        Image.fromarray(_resized(colours, _size(size_mm, scale)))
+        for colours, size_mm in zip(_SIDES[volume], sizes_mm, strict=True)
     )
-    for action, ink, line_width in planes:
+    for action, colour, line_width in planes:
         corners_mm = _corners_mm(volume, transform, action)
         if is_flipped:
             corners_mm[:, 0] = across_mm - corners_mm[:, 0]
         for picture, axes in ((frontal, [0, 1]), (sagittal, [2, 1])):
             corners = corners_mm[:, axes] * picture.size / np.array(volume.size_mm)[axes]
             outline = [(x, y) for x, y in (*corners, corners[0])]
-            ImageDraw.Draw(picture).line(outline, fill=ink, width=line_width)
+            ImageDraw.Draw(picture).line(outline, fill=colour, width=line_width)
     return frontal, sagittal
 
 
@@ -173,22 +175,22 @@ def reward_panel(rewards: Sequence[float], places: range, threshold: float, size
         return top - reward * (bottom - top)
 
     for reward in (0.0, -0.5, -1.0):
-        draw.line([(left, y_of(reward)), (right, y_of(reward))], fill=LINE_INK)
-        draw.text((left - 6, y_of(reward)), f"{reward:g}", fill=FAINT_INK, font=font(12), anchor="rm")
-    draw.line([(left, y_of(threshold)), (right, y_of(threshold))], fill=INK)
+        draw.line([(left, y_of(reward)), (right, y_of(reward))], fill=LINE_COLOUR)
+        draw.text((left - 6, y_of(reward)), f"{reward:g}", fill=FAINT_COLOUR, font=font(12), anchor="rm")
+    draw.line([(left, y_of(threshold)), (right, y_of(threshold))], fill=TEXT_COLOUR)
     for end, place, anchor in ((left, places[0], "la"), (right, places[-1], "ra")):
-        draw.text((end, bottom + 8), str(place), fill=FAINT_INK, font=font(12), anchor=anchor)
+        draw.text((end, bottom + 8), str(place), fill=FAINT_COLOUR, font=font(12), anchor=anchor)
     step = (right - left) / max(1, len(places) - 1)
     points = [(left + place * step, y_of(reward)) for place, reward in enumerate(rewards)]
-    draw.line(points, fill=REWARD_INK, width=2)
+    draw.line(points, fill=REWARD_COLOUR, width=2)
     x, y = points[-1]
-    draw.ellipse((x - 4, y - 4, x + 4, y + 4), fill=REWARD_INK)
+    draw.ellipse((x - 4, y - 4, x + 4, y + 4), fill=REWARD_COLOUR)
     return picture
 
 
-def _scale(size_mm: tuple[float, float], room: Size) -> float:
-    """Return the pixels per mm of the largest picture that fits into a room."""
-    return min(room[0] / size_mm[0], room[1] / size_mm[1])
+def _scale(size_mm: tuple[float, float], max_size: Size) -> float:
+    """Return the pixels per mm of the largest picture that fits into `max_size`."""
+    return min(max_size[0] / size_mm[0], max_size[1] / size_mm[1])
 
 
 def _size(size_mm: tuple[float, float], scale: float) -> Size:

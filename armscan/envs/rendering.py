@@ -14,11 +14,11 @@ from armscan.envs.episode import Episode
 from armscan.envs.observations import SliceGeometry, View
 from armscan.envs.panels import (
     BACKGROUND,
-    FAINT_INK,
-    INK,
-    OPTIMUM_INK,
-    PLANE_INK,
-    TISSUE_INKS,
+    FAINT_COLOUR,
+    OPTIMUM_COLOUR,
+    PLANE_COLOUR,
+    TEXT_COLOUR,
+    TISSUE_COLOURS,
     font,
     is_right_handed,
     reward_panel,
@@ -98,8 +98,8 @@ def draw_plane(
     """
     picture = Image.new("RGB", (WIDTH, HEIGHT), BACKGROUND)
     draw = ImageDraw.Draw(picture)
-    planes = [] if reference is None else [(reference.action, OPTIMUM_INK, 1)]
-    planes.append((plane, PLANE_INK, 2))
+    planes = [] if reference is None else [(reference.action, OPTIMUM_COLOUR, 1)]
+    planes.append((plane, PLANE_COLOUR, 2))
     # With fingers at low Y, as in phantoms.
     seen_from = "fingers" if is_right_handed(volume) else "elbow"
     frontal, sagittal = side_panels(volume, transform, planes, (_room(FRONTAL_BOX), _room(SAGITTAL_BOX)))
@@ -113,7 +113,7 @@ def draw_plane(
         panel = reward_panel(history.rewards, history.places, history.threshold, _room(REWARD_BOX))
         _place(picture, draw, REWARD_BOX, history.title, panel)
         goal_at = REWARD_BOX[2], REWARD_BOX[1] - TITLE_GAP
-        draw.text(goal_at, f"goal: above {history.threshold:g}", fill=INK, font=font(14), anchor="rs")
+        draw.text(goal_at, f"goal: above {history.threshold:g}", fill=TEXT_COLOUR, font=font(14), anchor="rs")
     _write_facts(draw, volume, plane, view, reference, caption)
     _write_legend(draw, reference)
     return np.asarray(picture)
@@ -147,7 +147,7 @@ def _room(box: Box) -> tuple[int, int]:
 
 
 def _place(picture: Image.Image, draw: ImageDraw.ImageDraw, box: Box, title: str, panel: Image.Image) -> None:
-    draw.text((box[0], box[1] - TITLE_GAP), title, fill=FAINT_INK, font=font(14), anchor="ls")
+    draw.text((box[0], box[1] - TITLE_GAP), title, fill=FAINT_COLOUR, font=font(14), anchor="ls")
     picture.paste(panel, box[:2])
 
 
@@ -161,7 +161,7 @@ def _write_facts(
 ) -> None:
     x, y = FACTS_AT
     heading = f"{caption}    reward {view.reward:.3f}" if caption else f"reward {view.reward:.3f}"
-    draw.text((x, y), heading, fill=INK, font=font(22))
+    draw.text((x, y), heading, fill=TEXT_COLOUR, font=font(22))
     bones, tendons, artery = view.clusters.counts
     rz, rx, tx, ty = plane.to_array()
     lines = [
@@ -174,7 +174,7 @@ def _write_facts(
         distance_mm, distance_deg = plane_distance(plane, reference.action, volume.slice_centre_mm)
         lines += [f"{distance_mm:.1f} mm and {distance_deg:.1f}°", f"from the {reference.name}"]
     for row, line in enumerate(lines):
-        draw.text((x, y + 38 + 22 * row), _shortened(line), fill=INK, font=font(15))
+        draw.text((x, y + 38 + 22 * row), _shortened(line), fill=TEXT_COLOUR, font=font(15))
 
 
 def _shortened(line: str) -> str:
@@ -189,8 +189,8 @@ def _shortened(line: str) -> str:
 
 def _write_legend(draw: ImageDraw.ImageDraw, reference: ReferencePlane | None) -> None:
     x, y = LEGEND_AT
-    legend = [("current plane", PLANE_INK)] + ([(reference.name, OPTIMUM_INK)] if reference else [])
-    legend += [(name, tuple(TISSUE_INKS[label].tolist())) for label, name in LABEL_NAMES.items() if label > 0]
-    for text, ink in legend:
-        draw.text((x, y), text, fill=ink, font=font(15))
+    legend = [("current plane", PLANE_COLOUR)] + ([(reference.name, OPTIMUM_COLOUR)] if reference else [])
+    legend += [(name, tuple(TISSUE_COLOURS[label].tolist())) for label, name in LABEL_NAMES.items() if label > 0]
+    for text, colour in legend:
+        draw.text((x, y), text, fill=colour, font=font(15))
         x += 16 + round(font(15).getlength(text))

@@ -33,7 +33,7 @@ ENTRIES_AT_ONCE = 200
 DIGEST_CHARS = 16
 # SHA-256 of the description that armscan wrote: one with another checksum was written by a person.
 DESCRIPTION_SUM_TAG = "note.sha256"
-LONGEST_PAUSE_S, LOOK_S = 5.0, 0.5
+LONGEST_PAUSE_S, POLL_S = 5.0, 0.5
 
 
 class Uploader:
@@ -68,7 +68,7 @@ class Uploader:
             Why not everything is uploaded; None if it is.
         """
         until_s, n_uploaded, is_told = time.monotonic() + wait_s, self._outbox.n_uploaded_bytes, False
-        while not self._is_done.wait(min(LOOK_S, max(0.0, until_s - time.monotonic()))):
+        while not self._is_done.wait(min(POLL_S, max(0.0, until_s - time.monotonic()))):
             if n_uploaded != (n_uploaded := self._outbox.n_uploaded_bytes):
                 until_s = time.monotonic() + wait_s
             if not self.is_unavailable or time.monotonic() > until_s:

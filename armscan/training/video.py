@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import GifImagePlugin, Image, ImageChops, ImageDraw
 
 from armscan.agents.protocols import Agent
-from armscan.envs.panels import INK, font
+from armscan.envs.panels import TEXT_COLOUR, font
 from armscan.training.episode_results import Env, EpisodeResult
 from armscan.training.episodes import play
 from armscan.utils.text import counted
@@ -154,5 +154,5 @@ def _titled(picture: Picture, title: str) -> Picture:
     if not title:
         return picture
     image = Image.fromarray(picture)
-    ImageDraw.Draw(image).text(TITLE_AT, title, fill=INK, font=font(13))
+    ImageDraw.Draw(image).text(TITLE_AT, title, fill=TEXT_COLOUR, font=font(13))
     return np.asarray(image)

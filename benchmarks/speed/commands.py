@@ -35,7 +35,7 @@ COMMANDS = {
     "`run data=nifti` without a path": (("run", "data=nifti"), None),
     "`run resume=zzzz`": (("run", "resume=zzzz"), None),
     "`runs list`": (("runs", "list"), None),
-    "`report --runs` of a run that is not there": (("report", "--runs", "abcd"), None),
+    "`report --runs` of a run that does not exist": (("report", "--runs", "abcd"), None),
     "`ui`, without its servers": (("ui", "--mlflow-port", "5998", "--dashboard-port", "5999"), "runs "),
     "`data inspect`, four volumes": (("data", "inspect", str(VOLUMES)), None),
     "MLflow alone, its store opened": (None, None),

@@ -37,7 +37,7 @@ from armscan.utils.log import silence_libraries
 from tests.support.mlflow_server import MlflowServer, mlflow_server
 
 THREADS = ("uploader", "pending", "system metrics")
-LOOK_S = 0.05
+POLL_S = 0.05
 
 
 class Cost(NamedTuple):
@@ -95,7 +95,7 @@ class ThreadClock(threading.Thread):
     def run(self) -> None:
         """Poll until `computed_s` is called."""
         process = psutil.Process()
-        while not self._over.wait(LOOK_S):
+        while not self._over.wait(POLL_S):
             ours = {each.native_id for each in threading.enumerate() if each.name in THREADS}
             self._seen |= {each.id: each.user_time + each.system_time for each in process.threads() if each.id in ours}
 

@@ -303,15 +303,15 @@ def test_places_of_earlier_looks_are_computed_in_32_bits_beside_mixed_precision(
     torch.testing.assert_close(seen[0], module.network.earlier_places(planes, geometry))
 
 
-def test_every_update_teaches_episodes_of_its_own(phantom, monkeypatch):
+def test_every_gradient_step_learns_from_episodes_of_its_own(phantom, monkeypatch):
     learner, _ = made(phantom)
-    seen, teach = [], learner._teach
+    seen, gradient_step = [], learner._gradient_step
 
     def recorded(*arguments):
         seen.append(learner._optima(learner._envs))
-        return teach(*arguments)
+        return gradient_step(*arguments)
 
-    monkeypatch.setattr(learner, "_teach", recorded)
+    monkeypatch.setattr(learner, "_gradient_step", recorded)
     learner.learn(24)
     assert len(seen) > 1
     assert not torch.equal(seen[0], seen[1])

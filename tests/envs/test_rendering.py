@@ -6,12 +6,12 @@ from gymnasium.wrappers import RecordEpisodeStatistics
 
 from armscan.envs import ArmscanEnv, ManipulatorAction
 from armscan.envs.panels import (
-    OPTIMUM_INK,
-    OUTLINE_INK,
-    PLANE_INK,
-    REWARD_INK,
+    OPTIMUM_COLOUR,
+    OUTLINE_COLOUR,
+    PLANE_COLOUR,
+    REWARD_COLOUR,
     SHADES,
-    TISSUE_INKS,
+    TISSUE_COLOURS,
     UNCLUSTERED,
     side_panels,
     slice_panel,
@@ -30,8 +30,8 @@ from armscan.errors import ResetNeededError
 from armscan.volumes import LabelVolume
 
 
-def n_shown(picture, ink):
-    return int((picture == np.array(ink, dtype=np.uint8)).all(axis=-1).sum())
+def n_shown(picture, colour):
+    return int((picture == np.array(colour, dtype=np.uint8)).all(axis=-1).sum())
 
 
 def within(picture, box):
@@ -40,7 +40,7 @@ def within(picture, box):
 
 
 def shaded(label, shade):
-    return (TISSUE_INKS[label] * shade).astype(np.uint8)
+    return (TISSUE_COLOURS[label] * shade).astype(np.uint8)
 
 
 @pytest.fixture
@@ -54,11 +54,11 @@ def test_render_shows_slice_planes_and_changes_with_the_step(env):
     first = env.render()
     assert first.shape == (HEIGHT, WIDTH, 3)
     assert first.dtype == np.uint8
-    for ink in (PLANE_INK, OPTIMUM_INK, *TISSUE_INKS):
-        assert n_shown(first, ink) > 0
+    for colour in (PLANE_COLOUR, OPTIMUM_COLOUR, *TISSUE_COLOURS):
+        assert n_shown(first, colour) > 0
     for box in (FRONTAL_BOX, SAGITTAL_BOX):
-        assert n_shown(within(first, box), PLANE_INK) > 100
-        assert n_shown(within(first, box), OPTIMUM_INK) > 20
+        assert n_shown(within(first, box), PLANE_COLOUR) > 100
+        assert n_shown(within(first, box), OPTIMUM_COLOUR) > 20
     env.step(np.array([0.2, 0.5]))
     assert (env.render() != first).any()
 
@@ -66,7 +66,7 @@ def test_render_shows_slice_planes_and_changes_with_the_step(env):
 def test_render_draws_the_reward_of_every_step(env):
     lasts = []
     for _ in range(4):
-        columns = (within(env.render(), REWARD_BOX) == REWARD_INK).all(axis=-1).any(axis=0)
+        columns = (within(env.render(), REWARD_BOX) == REWARD_COLOUR).all(axis=-1).any(axis=0)
         lasts.append(int(np.flatnonzero(columns).max()))
         if env.episode.is_running:
             env.step(np.array([0.9, -0.9]))
@@ -81,7 +81,7 @@ def test_render_shows_each_cluster_of_the_optimal_plane_apart(phantom):
     for label, n_clusters in ((1, 4), (2, 3), (3, 1)):
         for shade in SHADES[:n_clusters]:
             assert n_shown(picture, shaded(label, shade)) > 50
-    assert n_shown(picture, OUTLINE_INK) > 300
+    assert n_shown(picture, OUTLINE_COLOUR) > 300
 
 
 def test_render_outlines_clusters_alone():
@@ -95,15 +95,15 @@ def test_render_outlines_clusters_alone():
     assert picture.shape == (300, 600, 3)
     # Ten pixels per voxel, depth upward.
     voxels = picture[::-1].reshape(30, 10, 60, 10, 3)
-    for (across, depth), ink in (
+    for (across, depth), colour in (
         ((6, 6), shaded(1, SHADES[0])),
         ((34, 6), shaded(1, SHADES[1])),
         ((20, 20), shaded(3, UNCLUSTERED)),
-        ((40, 20), TISSUE_INKS[0]),
+        ((40, 20), TISSUE_COLOURS[0]),
     ):
-        assert (voxels[depth, :, across] == ink).all()
+        assert (voxels[depth, :, across] == colour).all()
     is_clustered = sum(tissue.image > 0 for tissue in view.clusters.each()) > 0
-    has_outline = (voxels == OUTLINE_INK).all(axis=-1).any(axis=(1, 3)).T
+    has_outline = (voxels == OUTLINE_COLOUR).all(axis=-1).any(axis=(1, 3)).T
     assert has_outline.sum() > 80
     assert not has_outline[~is_clustered].any()
 
@@ -117,18 +117,18 @@ def test_render_shows_a_volume_as_it_is_seen_from_the_palm_and_from_the_side(is_
     direction = np.diag([1.0 if is_right_handed else -1.0, 1.0, 1.0])
     volume = LabelVolume(labels, (1.0, 1.0, 1.0), "blocks", direction=direction)
     plane = ManipulatorAction((20.0, 0.0), (0.0, 10.0))
-    frontal, sagittal = map(np.asarray, side_panels(volume, None, [(plane, PLANE_INK, 1)], ((300, 400), (200, 400))))
+    frontal, sagittal = map(np.asarray, side_panels(volume, None, [(plane, PLANE_COLOUR, 1)], ((300, 400), (200, 400))))
     # Seen from high z with the fingers, at low y, up: X runs to the left in a right-handed frame.
     at_left, at_right = (frontal[300, column] for column in (40, 260))
     assert [*map(tuple, (at_left, at_right))] == [
-        tuple(TISSUE_INKS[label]) for label in ((2, 1) if is_right_handed else (1, 2))
+        tuple(TISSUE_COLOURS[label]) for label in ((2, 1) if is_right_handed else (1, 2))
     ]
     artery = 40 if is_right_handed else 260
-    assert tuple(frontal[150, artery]) == tuple(TISSUE_INKS[3])
-    rows, columns = np.nonzero((frontal == PLANE_INK).all(axis=-1))
+    assert tuple(frontal[150, artery]) == tuple(TISSUE_COLOURS[3])
+    rows, columns = np.nonzero((frontal == PLANE_COLOUR).all(axis=-1))
     assert (np.corrcoef(rows, columns)[0, 1] < 0) == is_right_handed
     # From the side, z runs to the right: the nearer tissue is at high x, or at low x in a left-handed frame.
-    assert tuple(sagittal[300, 50]) == tuple(TISSUE_INKS[2 if is_right_handed else 1])
+    assert tuple(sagittal[300, 50]) == tuple(TISSUE_COLOURS[2 if is_right_handed else 1])
 
 
 def test_draw_plane_without_an_episode_names_no_step_and_no_optimal_plane(phantom, monkeypatch):

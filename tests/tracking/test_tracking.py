@@ -126,7 +126,7 @@ def test_store_that_takes_long_is_waited_for_as_long_as_it_takes_entries(store, 
     def slow_upload(*arguments):
         upload_entries(*arguments)
         # Longer than the pause between two looks.
-        time.sleep(1.2 * uploader.LOOK_S)
+        time.sleep(1.2 * uploader.POLL_S)
         clock_s[0] += 40.0
 
     monkeypatch.setattr(uploader, "_upload", slow_upload)

@@ -178,9 +178,9 @@ def key_axis(key: str, distribution: BaseDistribution) -> dict[str, Any]:
     limits: Any = distribution
     ends = (math.log10(limits.low), math.log10(limits.high)) if limits.log else (limits.low, limits.high)
     # Room for the markers at both ends.
-    room = MARGIN * (ends[1] - ends[0])
+    margin = MARGIN * (ends[1] - ends[0])
     how = {"type": "log", "exponentformat": "power", "dtick": 1} if limits.log else {}
-    return {"title": key, "range": [ends[0] - room, ends[1] + room], **how}
+    return {"title": key, "range": [ends[0] - margin, ends[1] + margin], **how}
 
 
 def _reports(trials: Sequence[FrozenTrial], number: int, objective: str) -> Figure:

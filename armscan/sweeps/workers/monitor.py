@@ -16,7 +16,7 @@ from armscan.sweeps.study.phase import OpenedStudy
 from armscan.sweeps.workers.heartbeat import LivenessCheck
 from armscan.utils.retry import no_retry
 
-LOOK_S = 5.0
+POLL_S = 5.0
 # A launcher that waits longer than this after the end of a study is waiting for a lost worker.
 OVER_S = 20.0
 # There is no heartbeat between two trials, nor while a worker starts.
@@ -74,7 +74,7 @@ class StudyMonitor:
                     is_alive = True
                 if is_alive:
                     seen_s = time.monotonic()
-                time.sleep(LOOK_S)
+                time.sleep(POLL_S)
         return False
 
     def wait_for_requeue(self) -> None:
@@ -97,10 +97,10 @@ class StudyMonitor:
             over_s = 0.0
             with no_retry():
                 while over_s < OVER_S:
-                    if is_left.wait(LOOK_S):
+                    if is_left.wait(POLL_S):
                         return
                     with contextlib.suppress(ArmscanError):
-                        over_s = over_s + LOOK_S if self.is_over() else 0.0
+                        over_s = over_s + POLL_S if self.is_over() else 0.0
             is_over.set()
             signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGUSR1)
 

@@ -31,7 +31,7 @@ def storage_uri(tmp_path):
 @pytest.fixture
 def watch(make_scheduler, storage_uri, monkeypatch):
     """Watch a study of two trials, in which one is running; return the monitor, the schedulers and that trial."""
-    for name, value in (("LOOK_S", 0.05), ("OVER_S", 0.2), ("LIFELESS_S", 60.0)):
+    for name, value in (("POLL_S", 0.05), ("OVER_S", 0.2), ("LIFELESS_S", 60.0)):
         monkeypatch.setattr(module, name, value)
 
     def watch(n_final=0):
