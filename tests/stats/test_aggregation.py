@@ -40,6 +40,23 @@ def test_probability_of_improvement_is_that_of_rliable_and_its_interval_is_mirro
     assert surely.low < 1.0
 
 
+@given(two_groups())
+@settings(max_examples=40)
+def test_interval_of_improvement_solves_the_published_equation(groups):
+    estimate = probability_of_improvement(*groups)
+    n_ours, n_others = map(len, groups)
+    for end in estimate[1:]:
+        # Newcombe 2006, method 5: the exponential model's variance of the statistic, with the mean of both sizes.
+        size = (n_ours + n_others) / 2
+        terms = (
+            end * (1 - end),
+            (size - 1) * (1 - end) ** 2 * end / (2 - end),
+            (size - 1) * end**2 * (1 - end) / (1 + end),
+        )
+        variance = sum(terms) / (n_ours * n_others)
+        assert (estimate.value - end) ** 2 == pytest.approx(norm.ppf(0.975) ** 2 * variance, rel=1e-6, abs=1e-12)
+
+
 @pytest.mark.parametrize("n_seeds", [2, 3, 5, 10])
 @pytest.mark.parametrize("difference", [0.0, 1.0, 2.0])
 def test_interval_of_improvement_holds_the_truth_in_more_than_92_percent_of_studies(n_seeds, difference):
