@@ -65,6 +65,8 @@ def test_without_random_planes_on_the_same_volumes_nothing_is_said_of_them():
     figures = MetricEstimates.of(ours)
     assert beside_random(figures, [ours], evaluation([0.5])) is figures
     assert beside_random(figures, [ours], None) is figures
+    # One training of two suffices.
+    assert beside_random(figures, [evaluation([0.5]), ours], evaluation([0.5])) is figures
     said = headline({"agent": figures}, {})
     assert said.startswith("On plane, 5 mm 10°: agent 85.0% (")
     assert "random" not in said

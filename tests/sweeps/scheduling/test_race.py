@@ -6,8 +6,21 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.stats import t
 
-from armscan.sweeps.scheduling.race import LEADER_SEEDS, MAX_SEEDS_FACTOR, allocate, budget, race
+from armscan.sweeps.scheduling.race import (
+    END_LEVEL,
+    LEADER_SEEDS,
+    MAX_SEEDS_FACTOR,
+    PRIOR_DF,
+    allocate,
+    budget,
+    half_widths,
+    is_decided,
+    moments,
+    race,
+    round_size,
+)
 
 SEEDS = tuple(range(1000, 1012))
 score = st.one_of(st.floats(-9, 9), st.sampled_from([0.0, 1.0, math.nan]))
@@ -55,13 +68,13 @@ def test_race_begins_with_few_seeds_of_all_and_continues_with_those_that_may_be_
     scores = {-1: {}, 4: {}, 7: {}, 9: {}}
     begun = race(scores, SEEDS, min_seeds=2, mean_seeds=6)
     assert begun.missing == tuple((each, seed) for seed in (1000, 1001) for each in (-1, 4, 7, 9))
-    assert begun.leader is None
+    assert (begun.leader, begun.n_trained) == (None, 0)
     close = {-1: {1000: 0.9, 1001: 1.1}, 4: {1000: 1.2, 1001: 0.9}}
     scores = close | {7: {1000: -8.0, 1001: -7.7}, 9: {1000: -9.0, 1001: -8.7}}
     later = race(scores, SEEDS, min_seeds=2, mean_seeds=6)
     # A round has two trainings, or a third as many as there are configurations.
     assert later.missing == ((-1, 1002), (4, 1002))
-    assert later.leader == 4
+    assert (later.leader, later.n_trained) == (4, 8)
     assert later.chosen is None
 
 
@@ -99,6 +112,15 @@ def test_where_all_fail_the_round_before_decides_and_nothing_in_the_first():
     assert run(table, (2, 4), lambda missing: missing[0])[0].chosen == 4
 
 
+def test_race_ends_once_the_remaining_configurations_have_all_seeds():
+    table = {-1: [1.0, 1.2, 1.1], 4: [1.1, 1.0, 1.3], 7: [math.nan] * 3, 9: [math.nan] * 3}
+    ended, trained = run(table, (1, 3), lambda missing: missing[0], seeds=SEEDS[:3])
+    assert ended.n_trained == len(trained) == 8
+    assert [(each.n_seeds, each.estimate.value) for each in map(ended.standings.get, (-1, 4))] == [
+        (3, pytest.approx(np.mean(table[each]))) for each in (-1, 4)
+    ]
+
+
 def test_first_of_equal_configurations_is_chosen():
     table = {-1: [1.0] * 12, 4: [1.0] * 12}
     assert run(table, (2, 4), lambda missing: missing[-1])[0].chosen == -1
@@ -122,6 +144,39 @@ def test_seeds_are_allotted_as_in_the_optimal_computing_budget_allocation():
     assert allocate(np.zeros(3), np.zeros(3), np.array([2, 2, 2]), 3, most=10).sum() == 9
     capped = allocate(means, variances, np.array([2, 2, 2]), 6, most=4)
     assert capped.tolist() == [4, 4, 4]
+
+
+def test_variances_are_shrunk_towards_their_mean_as_in_moderated_t_statistics():
+    """Each counts by its degrees of freedom, the mean by `PRIOR_DF` (Smyth 2004)."""
+    scores, n_seeds = np.random.default_rng(0).standard_normal((4, 5)), np.array([2, 5, 3, 1])
+    means, variances = moments(scores, n_seeds)
+    played = [row[:n] for row, n in zip(scores, n_seeds, strict=True)]
+    own = np.array([each.var(ddof=1) for each in played[:-1]])
+    # A single seed has no variance of its own, so it takes the mean.
+    df = n_seeds[:-1] - 1
+    expected = [*(PRIOR_DF * own.mean() + df * own) / (PRIOR_DF + df), own.mean()]
+    assert means == pytest.approx([each.mean() for each in played])
+    assert variances == pytest.approx(expected)
+    widths = [t.ppf(0.975, PRIOR_DF + n - 1) * (of_it / n) ** 0.5 for n, of_it in zip(n_seeds, expected, strict=True)]
+    assert half_widths(variances, n_seeds) == pytest.approx(widths)
+
+
+def test_race_is_decided_where_the_leader_passes_every_t_test():
+    n_seeds, variances = np.array([LEADER_SEEDS + 2, LEADER_SEEDS, 3]), np.array([1.0, 2.0, 0.5])
+    least = [
+        t.ppf(END_LEVEL, PRIOR_DF + min(n_seeds[0], n) - 1) * (variances[0] / n_seeds[0] + variance / n) ** 0.5
+        for n, variance in zip(n_seeds[1:], variances[1:], strict=True)
+    ]
+    for factors, expected in (((1.01, 1.01), True), ((0.99, 1.01), False), ((1.01, 0.99), False)):
+        means = np.array([0.0, *(-gap * factor for gap, factor in zip(least, factors, strict=True))])
+        assert bool(is_decided(means, variances, n_seeds)) is expected
+    # However far ahead, a leader with few seeds decides nothing.
+    assert not is_decided(np.array([9e9, 0.0, 0.0]), variances, np.array([LEADER_SEEDS - 1, 9, 9]))
+
+
+@pytest.mark.parametrize(("n_configurations", "expected"), [(2, 2), (4, 2), (8, 2), (9, 3), (13, 4)])
+def test_round_has_a_training_for_every_three_configurations_but_at_least_two(n_configurations, expected):
+    assert round_size(n_configurations) == expected
 
 
 @pytest.mark.parametrize("n_configurations", [4, 8])

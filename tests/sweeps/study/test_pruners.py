@@ -63,6 +63,12 @@ def test_crowding_of_three_trials_in_a_row():
     assert crowding_distances(losses).tolist() == [math.inf, 2.0, math.inf]
 
 
+def test_within_a_front_the_trial_whose_neighbours_are_farther_away_is_better():
+    # The first dominates all others, which are one front: their crowding distances are inf, 1.5, 1.25 and inf.
+    losses = np.array([[0.0, 0.0], [10.0, 14.0], [11.0, 12.0], [13.0, 11.0], [14.0, 10.0]])
+    assert [n_better(np.roll(losses, -index, axis=0)) for index in range(5)] == [0, 1, 3, 4, 1]
+
+
 @pytest.fixture
 def report(storage_uri):
     """Report values of a trial at steps, as an attempt does; return the step at which it is pruned."""
@@ -89,6 +95,7 @@ def test_trial_that_others_dominate_is_pruned_at_its_first_report_on_a_rung(repo
     for good in (0.8, 0.9):
         assert report({100: (good, 5.0), 200: (good, 5.0)}) is None
     assert report({50: (0.0, 9.0), 100: (0.1, 9.0), 200: (0.1, 9.0)}) == 100
+    assert report({100: (0.95, 5.0), 200: (0.0, 9.0)}) == 200
     # Later than the rung, because it reports rarely.
     assert report({150: (0.1, 9.0)}) == 150
     # Only between two rungs is it behind.
