@@ -37,6 +37,8 @@ def test_landmark_reward_reproduces_every_golden_reward_to_the_last_bit(golden):
         (seen([1, 2, 3, 4], [6, 7, 8], [9, 9]), -(1 / 8 + 1) / 3),
         (seen([1, 2, 3, 4], [6, 7, 8], [5]), -1 / 3),
         (seen([1, 2, 3, 4], [6, 7, 8], [7]), -1 / 3),
+        (seen([7] * 4, [6, 7, 8], [9]), -1 / 3),
+        (seen([7] * 4, [6, 7, 8], [5]), -1 / 3),
     ],
 )
 def test_landmark_reward_adds_up_its_terms(clusters, reward):
@@ -107,12 +109,16 @@ def test_agreement_reward_costs_what_features_differ_from_the_labelled_planes():
     for side in (-1, 1):
         landmarks = np.array(
             [
-                [4, 0.75 * bones, 30, 12],
-                [3, 1.25 * tendons, 30 + 24 * side, 24],
-                [1, 0.92 * artery, 30 - 6 * side, 52],
+                [4, 0.75 * bones, 33, 17],
+                [3, 1.25 * tendons, 33 + 24 * side, 29],
+                [1, 0.92 * artery, 33 - 6 * side, 57],
             ]
         )
         assert reward.score(landmarks, volume.pixel_mm) == pytest.approx(-0.5 * sum(costs) / 7)
+    # Without bones, their area and all distances cost 1.
+    landmarks = np.array([[0, 0, 0, 0], [3, tendons, 24, 28], [1, artery, 36, 36]])
+    published = (4 / 8 + 1 / 3 + 1) / 3
+    assert reward.score(landmarks, volume.pixel_mm) == pytest.approx(-0.5 * (published + 5 / 7))
 
 
 def test_agreement_reward_is_minus_one_where_nothing_is_seen(agreement):
