@@ -23,7 +23,7 @@ HIDDEN_OF_STUDY = names.OF_STUDY | {names.STUDY_RUN, names.NOTE_SUM, names.RESET
 # The note has the run, the folder and the metrics of the seeds.
 HIDDEN = {
     *(names.LEASE, names.METRICS, names.SEEDS, names.CONFIG_SHA256),
-    *(names.ATTEMPT, names.RETRIED, names.DROPPED, names.RUN, names.FOLDER),
+    *(names.ATTEMPT, names.RETRIED, names.DROPPED, names.RUN, names.FOLDER, names.PRUNED_AT),
 }
 NAMES = {
     names.ENV_STEPS: "environment steps",

@@ -17,6 +17,8 @@ STOP = "stop"
 # Of a trial.
 LEASE, ENV_STEPS, METRICS, FAILURE = "lease", "env_steps", "figures", "failure"
 RETRIED, RETRY_OF, ATTEMPT, SEEDS = "retried", "retry_of", "attempt", "seeds"
+# The step of the report at which the pruner pruned it, known before its worker tells.
+PRUNED_AT = "pruned_at"
 # Of a waiting final training that another configuration of the study does not want: it counts nowhere.
 DROPPED = "dropped"
 # When it ran before it was requeued: pairs of start and end, in seconds since 1970.
@@ -31,7 +33,7 @@ FINALIST, FINAL_SEED, OF_CONFIG = "judged", "judged_seed", "study_config_sha256"
 MEMBER, GENERATION, INTERVAL, PARENT, SCHEDULE = "member", "generation", "interval", "parent", "schedule"
 # What a retry takes over from the attempt before.
 KEPT_BY_RETRY = (
-    *(SEEDS, FINALIST, FINAL_SEED, OF_CONFIG, STOP, ENQUEUED_FROM),
+    *(SEEDS, FINALIST, FINAL_SEED, OF_CONFIG, STOP, PRUNED_AT, ENQUEUED_FROM),
     *(MEMBER, GENERATION, INTERVAL, PARENT, SCHEDULE),
 )
 

@@ -88,6 +88,7 @@ class TrialAttributes(_Attributes):
     figures: dict[str, float] = Field(default={}, description="numbers by their names")
     failure: Text = ""
     stop: Text = ""
+    pruned_at: Number = 0
     taken_from: Text = ""
     enqueued_from: Text = ""
     retried: bool = Field(default=False, description="true or false")

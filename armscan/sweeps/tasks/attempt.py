@@ -20,7 +20,17 @@ from armscan.errors import InvalidValueError, listed
 from armscan.stats.bootstrap import interquartile_mean, mean
 from armscan.sweeps.scheduling.claim import PendingWrites
 from armscan.sweeps.scheduling.state import retried_by
-from armscan.sweeps.storage.attribute_names import ENV_STEPS, EPISODES, INTERVAL, PARENT, RETRY_OF, RUN, SEEDS, SUBJECTS
+from armscan.sweeps.storage.attribute_names import (
+    ENV_STEPS,
+    EPISODES,
+    INTERVAL,
+    PARENT,
+    PRUNED_AT,
+    RETRY_OF,
+    RUN,
+    SEEDS,
+    SUBJECTS,
+)
 from armscan.sweeps.storage.reports import reports_of, store_report
 from armscan.tracking import TrackedRun
 from armscan.training import Evaluation, Split
@@ -69,11 +79,14 @@ class Attempt:
     _of_seeds: dict[str, Mapping[str, float]] = field(init=False)
     # Steps that have been reported, including those before the trial was requeued or retried.
     _reported: set[int] = field(init=False)
+    # Step at which it was pruned, if its worker ended before it told so.
+    _pruned_at: int | None = field(init=False)
 
     def __post_init__(self) -> None:
-        self._of_seeds = dict(self.trial.user_attrs.get(SEEDS, {}))
+        attributes = self.trial.user_attrs
+        self._of_seeds, self._pruned_at = dict(attributes.get(SEEDS, {})), attributes.get(PRUNED_AT)
         self.env_steps = sum(int(one.get(ENV_STEPS, 0)) for one in self._of_seeds.values())
-        is_resumed = self.trial.user_attrs.keys() & {RUN, RETRY_OF}
+        is_resumed = attributes.keys() & {RUN, RETRY_OF}
         self._reported = set(reports_of(self.trial.storage.get_trial(self.trial._trial_id))) if is_resumed else set()
 
     @property
@@ -167,6 +180,8 @@ class Attempt:
         step = self.seeds.index(seed) * total_env_steps
         step += n_env_steps // report_every_env_steps * report_every_env_steps
         if step in self._reported:
+            if step == self._pruned_at:
+                raise optuna.TrialPruned
             return
         self._reported.add(step)
         values = [over_seeds(name, [one[name] for one in (*done, metrics)]) for name in self.objectives]
@@ -178,7 +193,13 @@ class Attempt:
         # Not by the trial's own methods: they never repeat a report, although the storage may have lost it with the
         # connection, and they refuse several objectives.
         store_report(storage, trial_id, step, values)
-        return study.pruner.prune(study, storage.get_trial(trial_id))
+        trial = storage.get_trial(trial_id)
+        # A pruner decides once: asked again, because only the reply was lost, Optuna's halving would let it continue.
+        if trial.user_attrs.get(PRUNED_AT) == step:
+            return True
+        if is_pruned := study.pruner.prune(study, trial):
+            storage.set_trial_user_attr(trial_id, PRUNED_AT, step)
+        return is_pruned
 
 
 def over_seeds(metric: str, values: Sequence[float]) -> float:

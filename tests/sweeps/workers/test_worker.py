@@ -15,7 +15,7 @@ import pytest
 
 from armscan.errors import FolderInUseError, InvalidValueError
 from armscan.sweeps.scheduling.claim import PlannedTrial
-from armscan.sweeps.scheduling.limits import Limits
+from armscan.sweeps.scheduling.limits import LimitReachedError, Limits
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
 from armscan.sweeps.scheduling.state import CONTROL
 from armscan.sweeps.space.space import Space
@@ -137,6 +137,35 @@ def test_worker_prunes_a_trial_of_several_objectives_that_is_behind_in_all(work)
     study = work("a", first_is_best, objectives=("mean_steps", "env_steps"), n_trials=3)
     assert [trial.state.name for trial in study.trials] == ["COMPLETE", "PRUNED", "PRUNED"]
     assert reports_of(study.trials[2]) == {50: (2.0, 2.0), 100: (2.0, 2.0)}
+
+
+@pytest.mark.parametrize("is_dead", [True, False], ids=["death", "interruption"])
+def test_trial_that_was_to_be_pruned_is_pruned_though_its_worker_ends_before_it_tells(work, is_dead):
+    ended, reported = [], []
+
+    def first_is_best(attempt):
+        metrics = dict.fromkeys(attempt.objectives, float(attempt.trial.number))
+        for step in (100, 300):
+            reported.append((attempt.trial.number, step))
+            try:
+                attempt.report(metrics, seed=0, n_env_steps=step, report_every_env_steps=100, total_env_steps=300)
+            except optuna.TrialPruned:
+                if attempt.trial.number != 1 or ended:
+                    raise
+                ended.append(step)
+                if is_dead:
+                    scheduler = TrialScheduler(attempt.trial.study, work.storage("a"), Limits(n_trials=3))
+                    scheduler.reclaim(lambda _: True)
+                    raise
+                raise LimitReachedError("it was interrupted") from None
+        return metrics
+
+    study = work("a", first_is_best, objectives=("mean_steps", "env_steps"), n_trials=3)
+    states = [trial.state.name for trial in study.trials]
+    assert states == ["COMPLETE", *["FAIL"][:is_dead], "PRUNED", "PRUNED"]
+    # No trial goes beyond the report at which it was to be pruned.
+    assert {step for number, step in reported if number > 0} == {100}
+    assert ended == [100]
 
 
 def test_worker_goes_on_after_a_trial_that_raised_and_says_what_it_raised(work):
