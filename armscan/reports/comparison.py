@@ -19,6 +19,7 @@ from armscan.reports.significance import (
     COMPARED_BY,
     Pair,
     baseline_metrics,
+    can_differ,
     compare_groups,
     complement,
     evaluations_by_seed,
@@ -84,7 +85,9 @@ def write_comparison(groups: Sequence[Group], left_out: Sequence[TrackedTraining
     reached = [final_metrics(group) for group in groups]
     pairs = compare_groups(groups)
     final = final_table(groups, reached)
-    tables = all_numbers(groups, curves, reached, pairs)
+    labels = {group.label for group in groups}
+    baselines = {name: each for name, each in final.results.items() if name not in labels}
+    tables = all_numbers(groups, curves, reached, pairs, baselines)
     titles = validation_titles(figures)
     has_other_volumes = any(each.probability is None for each in pairs["on_plane_rate"])
     parts = [
@@ -92,7 +95,7 @@ def write_comparison(groups: Sequence[Group], left_out: Sequence[TrackedTraining
         _summary(groups),
         notes_on(groups, left_out, curves, has_other_volumes=has_other_volumes),
         *_learning(groups, curves),
-        *_final(groups, reached, replace(final, headline="")),
+        *_final(groups, reached, replace(final, headline=""), baselines),
         *_better(groups, pairs),
         videos(groups),
         *_of_the_training(groups, curves, [figure for figure in figures if figure not in titles]),
@@ -159,13 +162,16 @@ def _title_of_training(metric: str) -> str:
     return metric.partition("/")[2].replace("_per_s", ", 1/s").replace("_", " ").replace("env ", "environment ")
 
 
-def _final(groups: Sequence[Group], reached: Sequence[MetricEstimates | None], final: ResultTable) -> Iterator[str]:
+def _final(
+    groups: Sequence[Group],
+    reached: Sequence[MetricEstimates | None],
+    final: ResultTable,
+    baselines: Mapping[str, MetricEstimates],
+) -> Iterator[str]:
     yield "<h2>On the test volumes</h2>"
     if not any(reached):
         yield "<p>None of these runs has kept a final evaluation.</p>"
         return
-    labels = {group.label for group in groups}
-    baselines = {name: each for name, each in final.results.items() if name not in labels}
     drawn = chart(final_chart(groups, reached, baselines), is_wide=True)
     yield f"<p>{HOW_FINAL}</p>{final.html()}{drawn}"
 
@@ -195,12 +201,16 @@ def _better(groups: Sequence[Group], pairs: Mapping[str, Sequence[Pair]]) -> Ite
         heading = f"By {'on-plane rate' if figure == 'on_plane_rate' else title_of(figure)}: "
         heading += f"{'higher' if COMPARED_BY[figure] else 'lower'} is better"
         matrices.append(f"<div><h3>{heading}</h3>{_matrix(groups, of_figure)}</div>")
-    # One seed has no interval, so its pairs are never bold.
+    n_seeds = [len(evaluations_by_seed(group)) for group in groups]
+    # With very few seeds, pairs are never bold.
     n_pairs = max(
-        sum(each.probability is not None and math.isfinite(each.probability.low) for each in of_figure)
+        sum(each.probability is not None and can_differ(n_seeds[each.ours], n_seeds[each.theirs]) for each in of_figure)
         for of_figure in pairs.values()
     )
-    by_chance = f" Of {n_pairs} pairs, {0.05 * n_pairs:.2g} would be bold by chance if all groups were alike."
+    by_chance = (
+        f" If all groups were alike, at most {0.05 * n_pairs:.2g} of {n_pairs} pairs would be bold by chance, on "
+        "average."
+    )
     drawn = f'<p>{HOW_BETTER}{by_chance * (n_pairs > 1)}</p><div class="matrices">{"".join(matrices)}</div>'
     yield drawn if len(groups) <= MANY_PAIRS else folded(f"Each of {len(groups)} groups against each other", drawn)
 
@@ -233,8 +243,11 @@ def _cell(probability: Estimate | None, *, is_few: bool) -> Markup:
     # From red through white to green.
     strength = abs(value - 0.5)
     shade = f"rgba({'44, 160, 44' if value >= 0.5 else '214, 39, 40'}, {strength:.2f})"
-    ends = "one seed" if math.isnan(low) else f"{low:.2f} to {high:.2f}"
-    shown = f"<b>{value:.2f}</b>" if low > 0.5 or high < 0.5 else f"{value:.2f}"
+    is_bold = low > 0.5 or high < 0.5
+    # A third digit where an end that excludes 0.5 would be rounded to it.
+    n_digits = 3 if is_bold and "0.50" in (f"{low:.2f}", f"{high:.2f}") else 2
+    ends = "one seed" if math.isnan(low) else f"{low:.{n_digits}f} to {high:.{n_digits}f}"
+    shown = f"<b>{value:.2f}</b>" if is_bold else f"{value:.2f}"
     below = f"<br><small>{ends}</small>" if is_few else ""
     return Markup(f'<div style="background: {shade}" title="{ends}">{shown}{below}</div>')
 

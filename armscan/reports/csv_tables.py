@@ -18,13 +18,14 @@ def all_numbers(
     curves: Curves,
     reached: Sequence[MetricEstimates | None],
     pairs: Mapping[str, Sequence[Pair]],
+    baselines: Mapping[str, MetricEstimates],
 ) -> dict[str, list[Row]]:
     """Return the tables by file name."""
     return {
         "runs": [_run_row(group, training) for group in groups for training in group.trainings],
         "curves": list(_curve_rows(groups, curves)),
         "seed_curves": list(_seed_rows(groups)),
-        "final": list(_final_rows(groups, reached)),
+        "final": list(_final_rows(groups, reached, baselines)),
         "final_by_volume": list(_volume_rows(groups)),
         "improvement": list(_pair_rows(groups, pairs)),
     }
@@ -38,7 +39,7 @@ def _run_row(group: Group, training: TrackedTraining) -> Row:
         **_seed_and_fold(training),
         "status": training.status,
         "environment steps": "" if math.isnan(training.env_steps) else int(training.env_steps),
-        "training, s": "" if math.isnan(training.wall_s) else round(training.wall_s),
+        "training, s": "" if math.isnan(training.wall_s) else training.wall_s,
         "not kept": ", ".join(training.missing),
     }
 
@@ -64,12 +65,15 @@ def _seed_rows(groups: Sequence[Group]) -> Iterator[Row]:
                     yield {**of_series, "env_steps": int(env_steps), "wall_s": wall_s, "value": value}
 
 
-def _final_rows(groups: Sequence[Group], reached: Sequence[MetricEstimates | None]) -> Iterator[Row]:
-    for group, figures in zip(groups, reached, strict=True):
+def _final_rows(
+    groups: Sequence[Group], reached: Sequence[MetricEstimates | None], baselines: Mapping[str, MetricEstimates]
+) -> Iterator[Row]:
+    names = (*(group.name for group in groups), *baselines)
+    for of, figures in zip(names, (*reached, *baselines.values()), strict=True):
         if figures is None:
             continue
         for name in figures.estimates:
-            yield {"group": group.name, "seeds": figures.n_seeds, "figure": name, **figures.estimate(name)._asdict()}
+            yield {"group": of, "seeds": figures.n_seeds, "figure": name, **figures.estimate(name)._asdict()}
 
 
 def _volume_rows(groups: Sequence[Group]) -> Iterator[Row]:

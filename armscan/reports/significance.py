@@ -12,7 +12,7 @@ import numpy as np
 
 from armscan.reports.groups import Group
 from armscan.reports.load import TrackedTraining
-from armscan.stats.aggregation import probabilities_of_improvement
+from armscan.stats.aggregation import probabilities_of_improvement, probability_of_improvement
 from armscan.stats.bootstrap import Estimate
 from armscan.training import Evaluation, MetricEstimates
 from armscan.training.baselines import RANDOM
@@ -72,6 +72,12 @@ def compare_groups(groups: Sequence[Group]) -> dict[str, list[Pair]]:
         known = dict(zip(comparable, found, strict=True))
         compared[figure] = [Pair(*pair, known.get(pair)) for pair in pairs]
     return compared
+
+
+@cache
+def can_differ(n_ours: int, n_theirs: int) -> bool:
+    """Return whether groups with so many seeds can be told apart, if all of one are better than all of the other."""
+    return probability_of_improvement(np.ones((n_ours, 1)), np.zeros((n_theirs, 1))).low > 0.5
 
 
 def have_same_volumes(groups: Sequence[Group]) -> bool:

@@ -2,7 +2,9 @@
 
 The difference from the random agent is paired: the rates on each volume are compared, so that a volume that is easy
 for both does not hide what the agent adds. Its interval is for other subjects and, with several trainings, other seeds.
-If the difference is the same for all subjects, the interval is Newcombe's, which takes episodes as independent.
+If the difference is the same for all subjects, the interval is Newcombe's, which takes episodes as independent. For
+one subject and several trainings, Newcombe's method combines the interval of the random agent's rate with that over
+seeds, or with that of one training's episodes if it is wider.
 """
 
 from __future__ import annotations
@@ -58,8 +60,17 @@ def beside_random(
     differences = of_subjects(weighted, [subject_of[name] for name in theirs])
     mean, half = crossed_mean(differences)
     above = Estimate.around(mean, half).clipped(-1.0, 1.0)
+    # Of one training: seeds play mostly the same episodes.
+    ours_once, of_random = _wilson_of(trainings[:1]), _wilson_of([random])
     if half < NO_WIDTH:
-        above = difference_of_rates(_wilson_of(trainings), _wilson_of([random]))
+        above = difference_of_rates(ours_once, of_random)
+    elif differences.shape[1] == 1 and math.isfinite(half):
+        # On one subject, the spread of the seeds contains neither the noise of their common episodes nor random's.
+        rate, once = of_random.value + mean, [abs(end - ours_once.value) for end in ours_once[1:]]
+        ours_overall = Estimate(
+            rate, *(rate + sign * max(half, each) for sign, each in zip((-1, 1), once, strict=True))
+        )
+        above = difference_of_rates(ours_overall, of_random).clipped(-1.0, 1.0)
     return replace(figures, estimates={**figures.estimates, ABOVE_RANDOM: above})
 
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from armscan.stats.bootstrap import Estimate
 from armscan.stats.on_plane import limits_among
+from armscan.training.metrics import METRICS, NOT_STARTED_SOLVED
 from armscan.utils.text import formatted
 from armscan.volumes.labelmap import LANDMARKS
 
@@ -64,6 +65,8 @@ TITLES = {
 # Shown where space is short, after the on-plane rates.
 LEADING = ("median_distance_mm", "median_distance_deg", "success_rate", "mean_steps")
 COSTS = ("env_steps", "training_s")
+# Metrics in steps; an episode has one step at least.
+STEPS = {name for name, (_, value) in METRICS.items() if value == "n_steps"}
 FORMS = {each.metric: each.form for each in QUANTITIES} | {"mean_return": "{:.2f}", "training_s": "{:.1f}"}
 
 
@@ -75,29 +78,36 @@ def leading_among(metrics: Iterable[str]) -> list[str]:
 
 def title_of(metric: str) -> str:
     """Return the title of a metric, with its statistic and unit, such as `steps, mean`."""
+    if metric.endswith(NOT_STARTED_SOLVED):
+        return f"{title_of(metric.removesuffix(NOT_STARTED_SOLVED))}, not started solved"
     limits = limits_among([metric])
     return limits[0].title if limits else TITLES.get(metric, metric.replace("_", " "))
 
 
 def is_rate(metric: str) -> bool:
     """Return whether a metric is a rate that is shown in percent."""
-    return metric.endswith(("success_rate", "nerve_shown_rate")) or bool(limits_among([metric.rpartition("/")[2]]))
+    name = _own_name(metric)
+    return name in ("success_rate", "nerve_shown_rate") or bool(limits_among([name]))
 
 
 def bounds_of(metric: str) -> tuple[float, float]:
     """Return the lowest and the highest value that a metric can have."""
-    name = metric.rpartition("/")[2]
+    name = _own_name(metric)
     if is_rate(metric) or "dice" in name:
         return 0.0, 1.0
-    if name not in {each.metric for each in (*QUANTITIES, *OLDER)}:
-        return -math.inf, math.inf
-    # An episode has one step at least.
-    return 1.0 if name.endswith("_steps") else 0.0, math.inf
+    if name in STEPS:
+        return 1.0, math.inf
+    return 0.0 if name in {each.metric for each in (*QUANTITIES, *OLDER)} else -math.inf, math.inf
+
+
+def _own_name(metric: str) -> str:
+    """Return the name of a metric without the prefix and suffix that say which episodes it is over."""
+    return metric.rpartition("/")[2].removesuffix(NOT_STARTED_SOLVED)
 
 
 def value_text(metric: str, value: float) -> str:
     """Return a value of a metric as tables show it: a share in percent, distances with one digit after the point."""
-    form = "{:.1%}" if is_rate(metric) else "{:,.0f}" if abs(value) >= 1000 else FORMS.get(metric, "{:.4g}")
+    form = "{:.1%}" if is_rate(metric) else "{:,.0f}" if abs(value) >= 1000 else FORMS.get(_own_name(metric), "{:.4g}")
     return formatted(form, value)
 
 

@@ -135,9 +135,10 @@ class MetricEstimates:
         return cls(n_seeds, n_volumes, n_subjects, n_episodes, n_solved, found, limits_among(found))
 
     def estimate(self, name: str) -> Estimate:
-        """Return a figure as it is shown: NaN if there is none; with Wilson's interval if its own has no width."""
+        """Return a figure as it is shown: NaN if there is none; with Wilson's interval if all episodes are equal."""
         estimate = self.estimates.get(name, UNKNOWN)
-        return estimate if estimate.has_width else self.estimates.get(name + WILSON, estimate)
+        are_equal = not estimate.has_width and math.isfinite(estimate.low)
+        return self.estimates.get(name + WILSON, estimate) if are_equal else estimate
 
     def metrics(self) -> dict[str, float]:
         """Return all numbers by name as they are shown, the ends of an interval as `..._low` and `..._high`."""

@@ -9,8 +9,13 @@ PERCENT = "{:.0%}"
 
 
 def formatted(form: str, value: float) -> str:
-    """Format a value, for instance by `{:.1%}`; instead of rounding to 0 or 100 %, a rate is `<0.1%` or `>99.9%`."""
+    """Format a value, for instance by `{:.1%}`; instead of rounding to 0 or 100 %, a rate is `<0.1%` or `>99.9%`.
+
+    A negative value that rounds to 0 has no sign.
+    """
     text = form.format(value)
+    if text.startswith("-") and not any(digit in text for digit in "123456789"):
+        text = text[1:]
     if form.endswith("%}") and 0.0 < value < 1.0:
         smallest = 10.0 ** -(len(text.partition(".")[2].rstrip("%")) + 2)
         for bound, sign, nearest in ((0.0, "<", smallest), (1.0, ">", 1.0 - smallest)):

@@ -2,12 +2,14 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from armscan.reports.charts import final_chart
-from armscan.reports.comparison import write_comparison
+from armscan.reports.comparison import _cell, write_comparison
 from armscan.reports.groups import Group, group_trainings
 from armscan.reports.significance import baseline_metrics, compare_groups, complement, final_metrics, have_same_volumes
+from armscan.stats.aggregation import probability_of_improvement
 from armscan.stats.bootstrap import Estimate
 from armscan.training import Evaluation
 from tests.reports.conftest import make_episode, rows
@@ -232,8 +234,23 @@ def test_runs_of_a_group_that_ran_other_code_are_told(written, make_training):
 
 
 def test_pairs_that_chance_alone_sets_in_bold_are_counted(written, make_training):
-    page, _ = written(*(make_training(seed, params={"agent.lr": str(lr)}) for lr in range(5) for seed in range(2)))
-    assert "Of 10 pairs, 0.5 would be bold by chance if all groups were alike." in page
+    # Four groups of three seeds and one of two, which none of the others can be told apart from.
+    page, _ = written(
+        *(make_training(seed, params={"agent.lr": str(lr)}) for lr in range(5) for seed in range(3 if lr else 2))
+    )
+    assert "If all groups were alike, at most 0.3 of 6 pairs would be bold by chance, on average." in page
+
+
+def test_end_that_excludes_one_half_is_not_rounded_to_it():
+    cell = _cell(probability_of_improvement(np.ones((3, 1)), np.zeros((3, 1))), is_few=True)
+    assert "<b>1.00</b>" in cell
+    assert "0.501 to 1.000" in cell
+
+
+def test_numbers_of_the_baselines_are_in_a_file(written, make_training):
+    _, rows = written(make_training(0, baselines={"random": Evaluation((make_episode("a", 7),))}))
+    of_random = [row for row in rows("final") if row["group"] == "random"]
+    assert [row["value"] for row in of_random if row["figure"] == "mean_steps"] == ["7.0"]
 
 
 def test_figures_of_one_evaluation_are_of_all_its_episodes(make_training):

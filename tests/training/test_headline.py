@@ -56,6 +56,17 @@ def test_difference_that_is_the_same_on_all_volumes_has_an_interval_for_other_ep
     assert "Not shown to be better than random: +10.0 points (" in said_of([0.9, 0.9], [0.8, 0.8])
 
 
+def test_difference_on_one_subject_contains_the_noise_of_random_planes():
+    """Agents that are as good as random planes are rarely said to be better or worse."""
+    rng, n_episodes, n_false = np.random.default_rng(0), 100, 0
+    for _ in range(100):
+        *ours, random = (evaluation([rng.binomial(n_episodes, 0.5) / n_episodes], n_episodes) for _ in range(6))
+        above = beside_random(MetricEstimates.of(ours[0]), ours, random).estimates[ABOVE_RANDOM]
+        assert above.value == pytest.approx(np.mean([each.on_plane_rate for each in ours]) - random.on_plane_rate)
+        n_false += not above.low <= 0.0 <= above.high
+    assert n_false <= 10
+
+
 def test_interval_of_a_difference_of_rates_ends_at_100_points():
     assert "(-100.0 to +100.0)" in said_of([0.0, 1.0, 0.5], [1.0, 0.0, 0.5])
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import numpy as np
 import pytest
 
 from armscan.training import Evaluation, MetricEstimates
@@ -42,6 +43,13 @@ def test_figures_of_several_trainings_are_the_same_once_they_are_tracked():
     sure = MetricEstimates.of(evaluation_of(1, 3))
     assert sure.estimate("success_rate") == sure.estimates["success_rate_wilson"]
     assert SEEDS not in sure.metrics()
+
+
+def test_rate_that_was_measured_on_one_of_several_wrists_has_no_interval():
+    episodes = [episode_of(volume=f"v{k}", starts_solved=k > 0, is_success=i > 2) for k in range(4) for i in range(6)]
+    estimate = MetricEstimates.of(Evaluation(tuple(episodes))).estimate("success_rate_not_started_solved")
+    assert estimate.value == 0.5
+    assert np.isnan(estimate[1:]).all()
 
 
 def test_figures_of_episodes_that_all_start_solved_are_not_those_of_others():

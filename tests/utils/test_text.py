@@ -19,7 +19,9 @@ from armscan.utils.text import formatted
         ("{:.1%}", 0.735, "73.5%"),
         ("{:.1%}", math.nan, "nan%"),
         ("{:.2f}", 0.0004, "0.00"),
+        ("{:.1f} mm", -0.04, "0.0 mm"),
+        ("{:.1f} mm", -0.06, "-0.1 mm"),
     ],
 )
-def test_rate_is_not_rounded_to_none_or_all(form, value, text):
+def test_rate_is_not_rounded_to_none_or_all_and_a_rounded_0_has_no_sign(form, value, text):
     assert formatted(form, value) == text

@@ -17,6 +17,7 @@ from plotly.graph_objects import Figure, Scatter
 
 from armscan.reports.chart_style import BLUE, GREY, ORANGE, RATE_AXIS, RED, line_mode
 from armscan.reports.html import chart
+from armscan.sweeps.results.csv_tables import comparable_trials, study_of_one_objective
 from armscan.sweeps.scheduling.population import searched_values
 from armscan.sweeps.scheduling.state import is_feasible
 from armscan.sweeps.space.parameter import overrides_of
@@ -66,12 +67,15 @@ def charts_of(
         better = "Higher" if direction == StudyDirection.MAXIMIZE else "Lower"
         yield _titled(f"History: {title}", _history(complete, number, objective, direction), f"{better} is better.")
         if rows := [row for row in shares if row["objective"] == objective]:
-            yield _titled(f"Importance of each key: {title}", _importance(rows), _on_importance(len(complete)))
+            n_trials = len(comparable_trials(complete))
+            yield _titled(f"Importance of each key: {title}", _importance(rows), _on_importance(n_trials))
         keys = list(dict.fromkeys(key for trial in complete for key in trial.params))
         drawn = "".join(chart(_slice(complete, key, number, objective)) for key in keys)
         said = f"<p>Grey: {violating}</p>" if violating else ""
         yield f'<h2>Slices of the space: {title}</h2>{said}<div class="charts">{drawn}</div>'
-        figure = plot_parallel_coordinate(_alone(complete, number, direction), target_name=title_of(objective))
+        figure = plot_parallel_coordinate(
+            study_of_one_objective(complete, number, direction), target_name=title_of(objective)
+        )
         # The scale ends in white.
         figure.update_layout(height=HEIGHT_PX, plot_bgcolor="#d0d0d0")
         said = f"Darker is better.{f' Dotted: {violating}' if violating else ''}"
@@ -81,24 +85,9 @@ def charts_of(
 def _on_importance(n_trials: int) -> str:
     said = (
         "How much each key sets the best tenth of the trials apart from all trials (PED-ANOVA), as a share of all "
-        "keys. A key that only tells bad trials from worse ones gets little."
+        "keys, among trials that violate no constraint. A key that only tells bad trials from worse ones gets little."
     )
     return said + (f" {counted(n_trials, 'trial')} say little: some fifty are required." if n_trials < ENOUGH else "")
-
-
-def _alone(trials: Sequence[FrozenTrial], number: int, direction: StudyDirection) -> optuna.Study:
-    """Return a study with one of the objectives: of a target function, Optuna does not know the direction."""
-    study = optuna.create_study(direction=direction)
-    study.add_trials(
-        optuna.create_trial(
-            value=trial.values[number],
-            params=trial.params,
-            distributions=trial.distributions,
-            constraints=trial.constraints,
-        )
-        for trial in trials
-    )
-    return study
 
 
 def _titled(heading: str, figure: Figure, said: str = "") -> str:

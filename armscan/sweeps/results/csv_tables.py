@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import optuna
 from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
+from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
 from armscan.reports.html import Row
@@ -15,7 +16,7 @@ from armscan.sweeps.results.final_results import ConfigResult
 from armscan.sweeps.results.judgement import Judgement
 from armscan.sweeps.results.selection import Candidate, score_rows
 from armscan.sweeps.scheduling.population import searched_values
-from armscan.sweeps.scheduling.state import TEST_PREFIX, is_feasible, loss_signs, seconds_of, was_retried
+from armscan.sweeps.scheduling.state import TEST_PREFIX, is_feasible, seconds_of, was_retried
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.attribute_names import (
     ENV_STEPS,
@@ -142,20 +143,39 @@ def _result_rows(found: Sequence[ConfigResult]) -> Iterator[Row]:
 
 
 def _importance_rows(study: optuna.Study, objectives: Sequence[str]) -> list[Row]:
-    """Return how much each key sets the best trials apart, relative to all keys; empty if too few have finished."""
+    """Return how much each key sets the best trials apart, relative to all keys.
+
+    Empty if too few have finished that violate no constraint, or all of these are equal.
+    """
     # PED-ANOVA: Watanabe et al. 2023, arXiv:2304.10255.
     rows: list[Row] = []
-    if len(study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))) < MIN_TRIALS_FOR_IMPORTANCE:
-        return rows
-    # With a target, the evaluator assumes that lower is better, and warns.
-    for number, (objective, sign) in enumerate(zip(objectives, loss_signs(study.directions).tolist(), strict=True)):
-        target = _value(number, sign) if len(objectives) > 1 else None
+    trials = comparable_trials(study.get_trials(deepcopy=False))
+    for number, (objective, direction) in enumerate(zip(objectives, study.directions, strict=True)):
+        alone = study_of_one_objective(trials, number, direction)
+        if len(trials) < MIN_TRIALS_FOR_IMPORTANCE or len({trial.value for trial in alone.trials}) == 1:
+            continue
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            shares = get_param_importances(study, evaluator=PedAnovaImportanceEvaluator(), target=target)
+            shares = get_param_importances(alone, evaluator=PedAnovaImportanceEvaluator())
         rows += [{"objective": objective, "key": key, "importance": share} for key, share in shares.items()]
     return rows
 
 
-def _value(number: int, sign: float) -> Callable[[FrozenTrial], float]:
-    return lambda trial: sign * float(trial.values[number])
+def comparable_trials(trials: Iterable[FrozenTrial]) -> list[FrozenTrial]:
+    """Return the completed trials that violate no constraint."""
+    return [trial for trial in trials if trial.state == TrialState.COMPLETE and is_feasible(trial)]
+
+
+def study_of_one_objective(trials: Iterable[FrozenTrial], number: int, direction: StudyDirection) -> optuna.Study:
+    """Return a study with one of the objectives: of a target function, Optuna does not know the direction."""
+    study = optuna.create_study(direction=direction)
+    study.add_trials(
+        optuna.create_trial(
+            value=trial.values[number],
+            params=trial.params,
+            distributions=trial.distributions,
+            constraints=trial.constraints,
+        )
+        for trial in trials
+    )
+    return study

@@ -22,10 +22,10 @@ from armscan.training import TEST, Evaluation, MetricEstimates, ResultTable
 from armscan.training.baselines import RANDOM
 from armscan.training.episode_results import subject_of_volumes
 from armscan.training.headline import beside_random
-from armscan.training.metric_display import bounds_of
+from armscan.training.metric_display import STEPS, bounds_of
+from armscan.training.metrics import NOT_STARTED_SOLVED
 from armscan.training.result_table import with_baselines
 
-STEPS = ("mean_steps", "iqm_steps")
 OF_VOLUME = re.compile(r"test/volume/(.+)/([^/]+)")
 
 
@@ -115,7 +115,8 @@ def _mean_of(name: str, of_seeds: Sequence[Mapping[str, float]], subject_of: Map
 def bounds_in(search: optuna.Study, metric: str) -> tuple[float, float]:
     """Return the lowest and highest value of a metric in a study; an episode has at most `env.max_steps`, if fixed."""
     least, most = bounds_of(metric)
-    return least, search.user_attrs[FIXED].get("env.max_steps", most) if metric in STEPS else most
+    is_in_steps = metric.removesuffix(NOT_STARTED_SOLVED) in STEPS
+    return least, search.user_attrs[FIXED].get("env.max_steps", most) if is_in_steps else most
 
 
 def subjects_of(trials: Sequence[FrozenTrial]) -> dict[str, str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +14,7 @@ from optuna.trial import FrozenTrial, TrialState
 
 from armscan.experiment.results import volume_notes
 from armscan.stats.aggregation import probability_of_improvement
-from armscan.stats.bootstrap import Estimate
+from armscan.stats.bootstrap import UNKNOWN, Estimate
 from armscan.stats.paired import paired_difference
 from armscan.sweeps.results.final_results import (
     ConfigResult,
@@ -54,12 +55,14 @@ class Difference(NamedTuple):
         is_higher_better: Whether higher values are better.
         paired: Mean difference (chosen minus control) over the seeds and volumes, with its 95 % interval.
         probability: Probability that a training of the chosen one is better on a volume than one of the control.
+        n_left_out: Number of test volumes that are left out, because a training has no value there. Default: 0.
     """
 
     metric: str
     is_higher_better: bool
     paired: Estimate
     probability: Estimate
+    n_left_out: int = 0
 
     @property
     def is_constant(self) -> bool:
@@ -79,24 +82,33 @@ class Difference(NamedTuple):
 
     def row(self) -> dict[str, str]:
         """Return its row of a table: cells by column."""
-        unit = " points" if is_rate(self.metric) else ""
-        sizes = (value_text(self.metric, abs(each)).removesuffix("%") for each in self.paired)
-        value, low, high = (f"{'-' if each < 0 else '+'}{size}" for each, size in zip(self.paired, sizes, strict=True))
+        _, low, high = map(self._text, self.paired)
         interval = f"{low} to {high}" if math.isfinite(self.paired.low) else ""
         if self.is_constant:
             interval = "none: all differences are equal"
         better = "higher" if self.is_higher_better else "lower"
         return {
             "on the test volumes": f"{title_of(self.metric)} ({better} is better)",
-            "chosen minus control": f"{value}{unit}",
+            "chosen minus control": self.value_text,
             "95 % interval": interval,
-            "probability of improvement": formatted(PERCENT, self.probability.value),
-            "its 95 % interval": (
-                f"{formatted(PERCENT, self.probability.low)} to {formatted(PERCENT, self.probability.high)}"
-                if math.isfinite(self.probability.low)
-                else ""
+            "probability of improvement": (
+                "" if math.isnan(self.probability.value) else formatted(PERCENT, self.probability.value)
             ),
+            "its 95 % interval": _interval_of(self.probability),
         }
+
+    @property
+    def value_text(self) -> str:
+        """The mean difference with its sign and unit, such as `+4.2 points`."""
+        if math.isnan(self.paired.value):
+            return ""
+        return f"{self._text(self.paired.value)}{' points' if is_rate(self.metric) else ''}"
+
+    def _text(self, value: float) -> str:
+        size = value_text(self.metric, abs(value)).removesuffix("%")
+        # A difference that is not 0 must not look like it.
+        is_shown = value == 0 or math.isnan(value) or any(digit in size for digit in "123456789")
+        return f"{'-' if value < 0 else '+'}{size if is_shown else f'{abs(value):.2g}'}"
 
 
 @dataclass(frozen=True)
@@ -141,6 +153,12 @@ class Judgement:
             name = "the control" if number == CONTROL else name_of(number)
             but = "" if self.chosen in self.violated else ", so it could not be chosen"
             notes.append(f"{name} violates {' and '.join(violated)} in the race{but}")
+        notes += (
+            f"{title_of(each.metric)} is compared without {counted(each.n_left_out, 'test volume')}: "
+            "a training has no value there"
+            for each in self.differences
+            if each.n_left_out
+        )
         if self.is_repeated:
             notes.append("the test volumes were used before, with another configuration of the study")
         if names := ", ".join(map(name_of, self.others)):
@@ -182,12 +200,16 @@ class Judgement:
                 reason = "their trainings have no test volume in common"
             return f"{name} was chosen, but it cannot be compared with the control: {reason}."
         first = self.differences[0]
+        if math.isnan(first.paired.value):
+            return (
+                f"{name} was chosen, but it cannot be compared with the control ({title_of(first.metric)}): no test "
+                "volume has a value in every training."
+            )
         if math.isnan(first.paired.low):
             return f"{name} was chosen; one seed does not show whether it is better than the control."
         if first.is_constant:
-            value = value_text(first.metric, first.paired.value)
             return (
-                f"{name} was chosen; its difference from the control is {value} for every seed and "
+                f"{name} was chosen; its difference from the control is {first.value_text} for every seed and "
                 f"volume ({title_of(first.metric)})."
             )
         if first.verdict:
@@ -196,6 +218,16 @@ class Judgement:
             f"{name} was chosen, but the test volumes do not show that it is better than the control: the interval of "
             f"the difference contains 0 ({title_of(first.metric)})."
         )
+
+
+def _interval_of(probability: Estimate) -> str:
+    if math.isnan(probability.low):
+        return ""
+    # A digit more where an end that excludes 50 % would be rounded to it.
+    form = PERCENT
+    if (probability.low > 0.5 or probability.high < 0.5) and "50%" in map(PERCENT.format, probability[1:]):
+        form = "{:.1%}"
+    return f"{formatted(form, probability.low)} to {formatted(form, probability.high)}"
 
 
 def judge(final: FinalEvaluation) -> Judgement | None:
@@ -291,13 +323,18 @@ def _differences(
     # First the objectives, by which the configuration was selected.
     for name in dict.fromkeys((*(name for name in objectives if name in tested), *leading_among(tested))):
         volumes, scores = scores_of(TEST_PREFIX + name, metrics)
-        # Without a common test volume, there is nothing to compare.
-        if not scores.size or not np.isfinite(scores).all():
-            continue
-        ours, theirs = scores[: len(chosen)], scores[len(chosen) :]
+        is_known = np.asarray(np.isfinite(scores).all(axis=0))
         is_higher_better = objectives[name] == MAXIMIZE if name in objectives else is_rate(name)
+        if not is_known.any():
+            # Without a common test volume, there is nothing to compare.
+            if len(is_known) and name in objectives:
+                yield Difference(name, is_higher_better, UNKNOWN, UNKNOWN, len(is_known))
+            continue
+        volumes, scores = [*compress(volumes, is_known)], scores[:, is_known]
+        ours, theirs = scores[: len(chosen)], scores[len(chosen) :]
         sign = 1.0 if is_higher_better else -1.0
         probability = probability_of_improvement(sign * ours, sign * theirs)
         paired = paired_difference(ours, theirs, [subject_of.get(volume, volume) for volume in volumes])
         least, most = bounds_in(search, name)
-        yield Difference(name, is_higher_better, paired.clipped(least - most, most - least), probability)
+        n_left_out = len(is_known) - len(volumes)
+        yield Difference(name, is_higher_better, paired.clipped(least - most, most - least), probability, n_left_out)

@@ -20,7 +20,16 @@ from armscan.sweeps.results.selection import candidates_of, decision_section
 from armscan.sweeps.scheduling.state import StudyState, env_steps_of, is_feasible
 from armscan.sweeps.scheduling.termination import REASON
 from armscan.sweeps.space.parameter import overrides_of
-from armscan.sweeps.storage.attribute_names import FINALIST, FOLDER, LEASE, OBJECTIVES, RUN, TAKEN_FROM, TERMINATED
+from armscan.sweeps.storage.attribute_names import (
+    EPISODES,
+    FINALIST,
+    FOLDER,
+    LEASE,
+    OBJECTIVES,
+    RUN,
+    TAKEN_FROM,
+    TERMINATED,
+)
 from armscan.sweeps.study.candidates import name_of, settings_of
 from armscan.sweeps.study.final_eval import FinalEvaluation
 from armscan.sweeps.study.study import best_trials, change_notes
@@ -174,9 +183,12 @@ def _videos(final_trials: Sequence[FrozenTrial]) -> str:
             address = video_address(files[0].read_bytes())
             caption = f"<figcaption>{name_of(number)}</figcaption>"
             videos[number] = f'<figure><img alt="an episode" src="{address}">{caption}</figure>'
-    if not videos:
+    # Trainings without episodes have no videos.
+    if not videos and not any(EPISODES in trial.system_attrs for trial in final_trials):
         return ""
-    return f'<h2>Episodes on a test volume</h2><div class="videos">{"".join(videos.values())}</div>'
+    missing = "<p>None: the folders of the final trainings are not here. Their runs have episode.gif.</p>"
+    drawn = f'<div class="videos">{"".join(videos.values())}</div>' if videos else missing
+    return f"<h2>Episodes on a test volume</h2>{drawn}"
 
 
 def _judgement(judgement: Judgement) -> str:

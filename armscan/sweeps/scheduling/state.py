@@ -18,6 +18,7 @@ from armscan.sweeps.storage.attribute_names import (
     LEASE,
     RETRIED,
     RETRY_OF,
+    SEEDS,
     TAKEN_FROM,
 )
 from armscan.utils.arrays import FloatArray
@@ -142,9 +143,10 @@ def retried_by(trial: FrozenTrial | Trial, trials: Sequence[FrozenTrial]) -> Ite
 
 
 def env_steps_of(trial: FrozenTrial) -> int:
-    """Return the environment steps of a trial, up to its last heartbeat."""
-    reported = (trial.user_attrs.get(ENV_STEPS, 0), trial.user_attrs.get(LEASE, {}).get(ENV_STEPS, 0))
-    return int(max(reported))
+    """Return the environment steps of a trial, up to its last heartbeat, and at least those of its finished seeds."""
+    attributes = trial.user_attrs
+    of_seeds = sum(metrics.get(ENV_STEPS, 0) for metrics in attributes.get(SEEDS, {}).values())
+    return int(max(attributes.get(ENV_STEPS, 0), attributes.get(LEASE, {}).get(ENV_STEPS, 0), of_seeds))
 
 
 def is_feasible(trial: FrozenTrial) -> bool:

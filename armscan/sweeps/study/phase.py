@@ -12,10 +12,10 @@ from optuna.trial import FrozenTrial, Trial
 
 from armscan.sweeps.scheduling.population import Population, searched_values
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
-from armscan.sweeps.scheduling.state import CONTROL
+from armscan.sweeps.scheduling.state import CONTROL, retried_by
 from armscan.sweeps.space.parameter import Value
 from armscan.sweeps.space.space import Space
-from armscan.sweeps.storage.attribute_names import FINALIST, RUN, SCHEDULE
+from armscan.sweeps.storage.attribute_names import FINALIST, RETRY_OF, RUN, SCHEDULE
 from armscan.sweeps.study.final_eval import FinalEvaluation
 from armscan.sweeps.study.settings import StudySettings
 from armscan.sweeps.tasks.attempt import Attempt, trial_folder
@@ -65,13 +65,15 @@ class Phase:
     population: Population | None = None
 
     def remove_checkpoints(self, finished: Trial) -> None:
-        """Remove the last checkpoints of a finished trial; the best ones stay.
+        """Remove the last checkpoints of a finished trial and of its earlier attempts; the best ones stay.
 
         In a population, remove the last checkpoints of all trials from which no member can continue any more.
         """
         numbers = {finished.number}
-        if self.population is not None:
+        if RETRY_OF in finished.user_attrs or self.population is not None:
             trials = self.scheduler.study.get_trials(deepcopy=False)
+            numbers |= {*retried_by(finished, trials)}
+        if self.population is not None:
             numbers = {trial.number for trial in trials} - self.population.checkpoints_to_keep(trials)
         for number in numbers:
             for file in trial_folder(self.folder, number).glob(f"seed_*/{LAST_CHECKPOINT}"):

@@ -91,6 +91,8 @@ class TrainingTask:
             is_elsewhere = attempt.interval is not None and not (_folder_of(attempt, seed) / RUN_FILE).exists()
             if seed not in attempt.seeds_done or is_elsewhere:
                 attempt.keep_seed(seed, _train(attempt, seed))
+            else:
+                _adopt(attempt, seed)
         of_seeds = [attempt.seeds_done[seed] for seed in attempt.seeds]
         return {name: over_seeds(name, [metrics[name] for metrics in of_seeds]) for name in of_seeds[0]}
 
@@ -185,20 +187,34 @@ def _train(attempt: Attempt, seed: int, conclude: Conclude | None = None) -> dic
     return reporter.metrics(result) | concluded
 
 
+def _adopt(attempt: Attempt, seed: int) -> None:
+    """Move a finished training of an earlier attempt to this one: its files, and its run below that of the trial."""
+    folder = _folder_of(attempt, seed)
+    if (folder / RUN_FILE).exists():
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    with folder_lock(folder):
+        config, _ = attempt.config(seed)
+        if found := _begun(folder, attempt, config):
+            client, run = found
+            for tag, value in _tags_of(attempt, folder).items():
+                client.set_tag(run.info.run_id, tag, value)
+
+
+def _tags_of(attempt: Attempt, folder: Path) -> dict[str, str]:
+    """Return the tags of a training that say where it belongs."""
+    return {**place_tags(folder), **attempt.tags, PARENT_TAG: attempt.run_id}
+
+
 def _start_or_resume(
     attempt: Attempt, setup: RunSetup, config: DictConfig, choices: dict[str, str], folder: Path
 ) -> tuple[RunSetup, TrackedRun, list[EpochReport]]:
     """Open the tracked run of a training, and restore the agent as an earlier attempt left it."""
     agent = setup.agent
     assert isinstance(agent, Learner)
-    found = _begun_in(folder, attempt, config)
-    for before in attempt.folders_before if found is None else ():
-        if found := _begun_in(before / folder.name, attempt, config):
-            _take_over(found[1].info.run_id, before / folder.name, folder)
-            break
-    if found is not None:
+    if found := _begun(folder, attempt, config):
         client, run = found
-        tags = {**volume_tags(setup), **place_tags(folder), **attempt.tags, PARENT_TAG: attempt.run_id}
+        tags = volume_tags(setup) | _tags_of(attempt, folder)
         reopen = partial(TrackedRun.reopen, client, run, folder=folder, config=to_plain(config), tags=tags)
         if (folder / LAST_CHECKPOINT).exists():
             try:
@@ -216,6 +232,17 @@ def _start_or_resume(
     tracked = start_tracking(config, invocation, setup, tags=attempt.tags, retry_s=RETRY_S)
     atomic_write(folder / RUN_FILE, json.dumps({"run_id": tracked.run_id}))
     return setup, tracked, begin_generation(attempt, setup, folder, run_id=tracked.run_id)
+
+
+def _begun(folder: Path, attempt: Attempt, config: DictConfig) -> tuple[TrackingStore, Run] | None:
+    """Return the tracked run of a training, with its store, after taking it over from an earlier attempt."""
+    if found := _begun_in(folder, attempt, config):
+        return found
+    for before in attempt.folders_before:
+        if found := _begun_in(before / folder.name, attempt, config):
+            _take_over(found[1].info.run_id, before / folder.name, folder)
+            return found
+    return None
 
 
 def _begun_in(folder: Path, attempt: Attempt, config: DictConfig) -> tuple[TrackingStore, Run] | None:

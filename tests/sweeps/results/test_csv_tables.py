@@ -1,5 +1,6 @@
 """Rows of a study's CSV files."""
 
+import numpy as np
 import optuna
 import pytest
 
@@ -45,3 +46,25 @@ def test_importances_of_each_of_several_objectives_explain_its_best_trials(direc
             study.tell(trial, [sign * (x if x > 0.5 else 0.5 * y)] * n_objectives)
         rows.append(_importance_rows(study, ["a", "b"][:n_objectives]))
     assert rows[1][:2] == rows[0] != []
+
+
+def importances(trials):
+    """Return the importances of trials: values `x` and `y`, the objective, and the violation of a constraint."""
+    study = optuna.create_study(direction="minimize")
+    of_xy = dict.fromkeys("xy", optuna.distributions.FloatDistribution(0.0, 1.0))
+    study.add_trials(
+        optuna.create_trial(value=value, params={"x": x, "y": y}, distributions=of_xy, constraints={"a": violation})
+        for x, y, value, violation in trials
+    )
+    return {row["key"]: row["importance"] for row in _importance_rows(study, ["steps"])}
+
+
+def test_importances_leave_out_trials_that_violate_a_constraint():
+    points = np.random.default_rng(0).random((80, 2))
+    # Where y is large, trials violate it and are best.
+    found = importances((x, y, x - 9.0 * (y > 0.85), y - 0.85) for x, y in points.tolist())
+    assert found["x"] > 0.9
+
+
+def test_trials_that_are_all_equal_have_no_importances():
+    assert importances((x, x, 1.0, -1.0) for x in np.linspace(0.0, 1.0, 20).tolist()) == {}

@@ -9,6 +9,7 @@ import optuna
 import pytest
 from PIL import Image
 
+from armscan.sweeps.results.report import _videos
 from armscan.sweeps.scheduling.limits import Limits
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
 from armscan.sweeps.storage.storage import open_storage
@@ -147,6 +148,13 @@ def test_videos_are_after_the_charts_and_pruned_trials_look_so(answer, tmp_path)
     assert page.index("<h2>Parallel") < page.index("<h2>Episodes on a test volume") < page.index("<h2>Trials")
     lines = {each["name"]: each["marker"]["symbol"][-1] for each in chart_below(page, "While training")}
     assert lines == {"finished": "circle", "pruned": "x", "failed": "circle"}
+
+
+def test_videos_whose_folders_are_gone_are_told(tmp_path):
+    kept = {"judged": 0, "folder": str(tmp_path / "gone")}
+    trials = [optuna.create_trial(value=1.0, user_attrs=kept, system_attrs=attrs) for attrs in ({}, {"episodes": {}})]
+    assert _videos(trials[:1]) == ""
+    assert "None: the folders of the final trainings are not here. Their runs have episode.gif." in _videos(trials)
 
 
 def test_report_shows_how_a_study_decided(answer, tmp_path, browser):

@@ -89,7 +89,8 @@ def test_limits_of_time_and_environment_steps_end_a_study(make_scheduler):
     scheduler = make_scheduler(max_env_steps=100)
     scheduler.claim({"env_steps": 99})
     assert scheduler.end_reason(scheduler.state()) is None
-    scheduler.claim({"env_steps": 1})
+    # A retry begins with the seeds that its trial had finished.
+    scheduler.claim({}).set_user_attr("seeds", {"0": {"env_steps": 1}})
     assert scheduler.end_reason(scheduler.state()) == "the 100 environment steps of study.max_env_steps are taken"
     assert make_scheduler(timeout_hours=1.0).end_reason(scheduler.state()) is None
     time.sleep(0.1)

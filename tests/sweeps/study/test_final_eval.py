@@ -83,18 +83,19 @@ def steps_of(number, seed, true):
     return true[number] + 0.3 * rng.standard_normal() + 0.2 * rng.standard_normal(3)
 
 
-def end(scheduler, trial, true):
+def end(scheduler, trial, true, measured=steps_of):
     """End a final training as its worker does."""
     number, seed = training_of(trial)
-    steps = steps_of(number, seed, true)
-    metrics = {"mean_steps": steps.mean(), "test/mean_steps": steps.mean(), "test/success_rate": 1.0}
+    steps = measured(number, seed, true)
+    mean = np.nanmean(steps)
+    metrics = {"mean_steps": mean, "test/mean_steps": mean, "test/success_rate": 1.0}
     metrics |= {f"test/volume/v{volume}/mean_steps": value for volume, value in enumerate(steps)}
     metrics |= {f"test/volume/v{volume}/success_rate": 1.0 for volume in range(3)}
     trial.set_user_attr(METRICS, {name: float(value) for name, value in metrics.items()})
-    trial.study.tell(trial, float(steps.mean()))
+    trial.study.tell(trial, float(mean))
 
 
-def run(uri, true=TRUE, chance=None, **changes):
+def run(uri, true=TRUE, chance=None, measured=steps_of, **changes):
     """Run a final evaluation with workers that come and go; return it."""
     chance = chance or random.Random(0)
     final, schedulers = opened(uri, **changes)
@@ -113,7 +114,7 @@ def run(uri, true=TRUE, chance=None, **changes):
             elif chance.random() < 0.1:
                 scheduler.requeue(trial, {"worker": trial.user_attrs["lease"]["worker"]})
             else:
-                end(scheduler, trial, true)
+                end(scheduler, trial, true, measured)
     return final
 
 
@@ -570,6 +571,38 @@ def test_difference_that_is_the_same_everywhere_has_no_interval_to_speak_of():
     )
     assert (
         judgement.statement
-        == "Trial 3 was chosen; its difference from the control is 100.0% for every seed and volume "
+        == "Trial 3 was chosen; its difference from the control is +100.0 points for every seed and volume "
         "(success, by reward)."
     )
+
+
+def test_difference_that_is_not_0_does_not_look_like_it():
+    difference = Difference("median_distance_mm", False, Estimate(-0.03, -0.049, -0.011), Estimate(1.0, 0.501, 1.0))
+    row = difference.row()
+    assert row["chosen minus control"] == "-0.03"
+    assert row["95 % interval"] == "-0.049 to -0.011"
+    assert row["its 95 % interval"] == "50.1% to 100.0%"
+
+
+@pytest.mark.parametrize("n_unknown", [1, 3])
+def test_volume_without_a_value_is_left_out_of_the_comparison_and_the_result_says_so(storage_uri, n_unknown):
+    def steps_with_unknown(number, seed, true):
+        steps = steps_of(number, seed, true)
+        # One volume of a judged training, or another one of each.
+        unknown = {1: [(1, 2001, 1)], 3: [(1, 2000, 0), (1, 2001, 1), (CONTROL, 2002, 2)]}[n_unknown]
+        return np.where([(number, seed, volume) in unknown for volume in range(3)], np.nan, steps)
+
+    final = run(storage_uri, chance=QUIET, measured=steps_with_unknown)
+    judgement = judge(final)
+    first = judgement.differences[0]
+    assert (first.metric, first.n_left_out) == ("mean_steps", n_unknown)
+    assert f"steps, mean is compared without {n_unknown} test volume" in " ".join(judgement.notes)
+    if n_unknown == 1:
+        assert judgement.statement == "Trial 1 is better than the control (steps, mean)."
+    else:
+        assert judgement.statement == (
+            "Trial 1 was chosen, but it cannot be compared with the control (steps, mean): no test volume has a value "
+            "in every training."
+        )
+        assert set(first.row().values()) == {"steps, mean (lower is better)", ""}
+    assert result_note(judgement)

@@ -208,6 +208,21 @@ def test_last_checkpoint_stays_until_the_storage_has_the_outcome_of_its_trial(wo
     assert [file.parts[-3] for file in folder.rglob(LAST_CHECKPOINT)] == ["0001"]
 
 
+def test_retry_that_has_finished_removes_the_last_checkpoint_of_the_dead_attempt(work):
+    def first_dies(attempt):
+        checkpoint = attempt.folder / "seed_0" / LAST_CHECKPOINT
+        checkpoint.parent.mkdir(parents=True)
+        checkpoint.touch()
+        if attempt.trial.number == 0:
+            TrialScheduler(attempt.trial.study, work.storage("a"), Limits(n_trials=1)).reclaim(lambda _: True)
+            assert checkpoint.exists()
+        return far_from_a_thousandth(attempt)
+
+    study = work("a", first_dies, n_trials=1)
+    assert [trial.state.name for trial in study.trials] == ["FAIL", "COMPLETE"]
+    assert not [*work.storage("a").lock_file.parent.rglob(LAST_CHECKPOINT)]
+
+
 def test_trial_whose_folder_another_process_still_uses_is_requeued(work, monkeypatch):
     monkeypatch.setattr(worker, "WAIT_S", 0.0)
     seen = []
