@@ -60,17 +60,15 @@ def beside_random(
     differences = of_subjects(weighted, [subject_of[name] for name in theirs])
     mean, half = crossed_mean(differences)
     above = Estimate.around(mean, half).clipped(-1.0, 1.0)
-    # Of one training: seeds play mostly the same episodes.
-    ours_once, of_random = _wilson_of(trainings[:1]), _wilson_of([random])
+    # Of one training: the seeds play mostly the same episodes.
+    of_one, of_random = _wilson_of(trainings[:1]), _wilson_of([random])
     if half < NO_WIDTH:
-        above = difference_of_rates(ours_once, of_random)
+        above = difference_of_rates(of_one, of_random)
     elif differences.shape[1] == 1 and math.isfinite(half):
         # On one subject, the spread of the seeds contains neither the noise of their common episodes nor random's.
-        rate, once = of_random.value + mean, [abs(end - ours_once.value) for end in ours_once[1:]]
-        ours_overall = Estimate(
-            rate, *(rate + sign * max(half, each) for sign, each in zip((-1, 1), once, strict=True))
-        )
-        above = difference_of_rates(ours_overall, of_random).clipped(-1.0, 1.0)
+        rate, once = of_random.value + mean, [abs(end - of_one.value) for end in of_one[1:]]
+        of_all = Estimate(rate, *(rate + sign * max(half, each) for sign, each in zip((-1, 1), once, strict=True)))
+        above = difference_of_rates(of_all, of_random).clipped(-1.0, 1.0)
     return replace(figures, estimates={**figures.estimates, ABOVE_RANDOM: above})
 
 
