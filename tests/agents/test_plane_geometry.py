@@ -57,8 +57,10 @@ def test_a_plane_beside_another_is_parallel_and_as_far_along_the_normal(geometry
     np.testing.assert_allclose(between[:, 0], 18.0, atol=1e-4)
 
 
-def test_planes_slide_into_the_bounds_as_one_by_one(geometry):
-    outside = drawn(2) + torch.tensor([0.0, 0.0, -45.0, 0.0])
+@pytest.mark.parametrize("tx_mm", [-45.0, 65.0])
+def test_planes_slide_into_the_bounds_as_one_by_one(geometry, tx_mm):
+    outside = drawn(2) + torch.tensor([0.0, 0.0, tx_mm, 0.0])
+    assert ((outside[:, 2] < 0.0) | (outside[:, 2] > 97.2)).sum() > 50
     # Through the middle of its slice.
     found = geometry.through(geometry.normals(outside), geometry.middles(outside))
     for plane, shifted in zip(one_by_one(outside), found.numpy(), strict=True):
