@@ -102,15 +102,15 @@ def draw_plane(
     planes.append((plane, PLANE_COLOUR, 2))
     # With fingers at low Y, as in phantoms.
     seen_from = "fingers" if is_right_handed(volume) else "elbow"
-    frontal, sagittal = side_panels(volume, transform, planes, (_room(FRONTAL_BOX), _room(SAGITTAL_BOX)))
+    frontal, sagittal = side_panels(volume, transform, planes, (_size_of(FRONTAL_BOX), _size_of(SAGITTAL_BOX)))
     for box, title, panel in (
-        (SLICE_BOX, f"slice, palm up, from the {seen_from}", slice_panel(view, _room(SLICE_BOX))),
+        (SLICE_BOX, f"slice, palm up, from the {seen_from}", slice_panel(view, _size_of(SLICE_BOX))),
         (FRONTAL_BOX, "frontal, from the palm", frontal),
         (SAGITTAL_BOX, "sagittal", sagittal),
     ):
         _place(picture, draw, box, title, panel)
     if history is not None:
-        panel = reward_panel(history.rewards, history.places, history.threshold, _room(REWARD_BOX))
+        panel = reward_panel(history.rewards, history.places, history.threshold, _size_of(REWARD_BOX))
         _place(picture, draw, REWARD_BOX, history.title, panel)
         goal_at = REWARD_BOX[2], REWARD_BOX[1] - TITLE_GAP
         draw.text(goal_at, f"goal: above {history.threshold:g}", fill=TEXT_COLOUR, font=font(14), anchor="rs")
@@ -142,7 +142,7 @@ def view_of(volume: LabelVolume, plane: ManipulatorAction, *, tissues: Tissues =
     )
 
 
-def _room(box: Box) -> tuple[int, int]:
+def _size_of(box: Box) -> tuple[int, int]:
     return box[2] - box[0], box[3] - box[1]
 
 

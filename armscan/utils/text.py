@@ -14,7 +14,7 @@ def formatted(form: str, value: float) -> str:
     A negative value that rounds to 0 has no sign.
     """
     text = form.format(value)
-    if text.startswith("-") and not any(digit in text for digit in "123456789"):
+    if text.startswith("-") and is_zero(text):
         text = text[1:]
     if form.endswith("%}") and 0.0 < value < 1.0:
         smallest = 10.0 ** -(len(text.partition(".")[2].rstrip("%")) + 2)
@@ -22,6 +22,11 @@ def formatted(form: str, value: float) -> str:
             if text == form.format(bound):
                 return sign + form.format(nearest)
     return text
+
+
+def is_zero(text: str) -> bool:
+    """Return whether a number, as it is shown, is 0."""
+    return "0" in text and not any(digit in text for digit in "123456789")
 
 
 def counted(number: int, what: str) -> str:

@@ -35,7 +35,7 @@ from armscan.training.episode_results import TEST_METRICS
 from armscan.training.headline import headline
 from armscan.training.metric_display import is_rate, leading_among, title_of, value_text
 from armscan.training.metrics import ENDS
-from armscan.utils.text import PERCENT, counted, formatted, markdown_table
+from armscan.utils.text import PERCENT, counted, formatted, is_zero, markdown_table
 
 MAXIMIZE = "maximize"
 # Prefixes of the metrics of a study's run that compare the chosen configuration with the control.
@@ -107,8 +107,9 @@ class Difference(NamedTuple):
     def _text(self, value: float) -> str:
         size = value_text(self.metric, abs(value)).removesuffix("%")
         # A difference that is not 0 must not look like it.
-        is_shown = value == 0 or math.isnan(value) or any(digit in size for digit in "123456789")
-        return f"{'-' if value < 0 else '+'}{size if is_shown else f'{abs(value):.2g}'}"
+        if value and is_zero(size):
+            size = f"{abs(value):.2g}"
+        return f"{'-' if value < 0 else '+'}{size}"
 
 
 @dataclass(frozen=True)
