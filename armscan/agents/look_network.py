@@ -194,10 +194,14 @@ class FinderModule(nn.Module):
             looks.append({name: torch.cat([part[:, :1], part[:, :-1]], dim=1) for name, part in looks[-1].items()})
         return {name: torch.cat([each[name] for each in looks]) for name in (IMAGE, ACTION)}
 
+    def is_sure(self, expected: Tensor) -> Tensor:
+        """Return whether the agent stops at planes with these expected errors, shape (..., 2), before its last look."""
+        return (expected <= self.sure).all(-1)
+
     def actions(self, estimate: PlaneEstimate) -> Tensor:
         """Return the next actions, shape (n, n_action)."""
         beside_mm = estimate.step @ self.offsets
-        is_last = (estimate.step[:, -1] > 0.0) | (estimate.expected <= self.sure).all(1)
+        is_last = (estimate.step[:, -1] > 0.0) | self.is_sure(estimate.expected)
         beside_mm = beside_mm.masked_fill(is_last, 0.0)
         actions = self.geometry.actions(self.geometry.from_frame(estimate.plane, estimate.place, beside_mm))
         if self._has_stop:

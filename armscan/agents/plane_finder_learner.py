@@ -35,6 +35,8 @@ FIRST_LOOK = (2.0, 2.0, 5.0, 1.0)
 EXPECTED_ERROR_WEIGHT = 0.1
 # Episodes that the expected errors are calibrated on.
 N_CALIBRATION = 96
+# Each round of the calibration halves the distance to its result.
+N_CALIBRATION_ROUNDS = 24
 
 
 class PlaneFinderLearner(SupervisedLearner):
@@ -137,20 +139,19 @@ class PlaneFinderLearner(SupervisedLearner):
 
     def _further_metrics(self, seed: int) -> dict[str, float]:
         """Calibrate the expected errors to be right on average on the validation volumes; return the metrics there."""
-        envs = self._calibration_envs
-        if envs is None:
+        if self._calibration_envs is None:
             return {}
-        with torch.no_grad():
-            observations, _ = reset_each(envs, seed)
-            optima = self._optima(envs)
-            for _ in range(self._finder.n_looks - 1):
-                (actions, _), _ = self._network(self._tensors(observations))
-                if self._has_stop:
-                    actions[:, 4] = -1.0
-                observations = envs.step(actions.cpu().numpy())[0]
-            (actions, expected), _ = self._network(self._tensors(observations))
-            errors = self._module.geometry.errors(self._module.geometry.planes(actions[:, :4]), optima)
-            self._module.calibration.mul_(errors.mean(0) / expected.mean(0).clamp(min=1e-6))
+        expected_at_looks, errors_at_looks = self._answers(self._calibration_envs, seed)
+        episodes = torch.arange(errors_at_looks.shape[1], device=self._device)
+        for _ in range(N_CALIBRATION_ROUNDS):
+            # The factor decides where the agent is sure enough to stop, and the answers there decide the factor.
+            is_last = self._module.is_sure(expected_at_looks * self._module.calibration)
+            is_last[-1] = True
+            last = is_last.int().argmax(0)
+            expected, errors = expected_at_looks[last, episodes], errors_at_looks[last, episodes]
+            factor = errors.mean(0) / expected.mean(0).clamp(min=1e-6)
+            # Halfway on a logarithmic scale, because whole steps may swing between two factors for ever.
+            self._module.calibration.copy_((self._module.calibration * factor).sqrt())
         metrics = {}
         for i, unit in enumerate(("mm", "deg")):
             order = expected[:, i].argsort()
@@ -160,6 +161,29 @@ class PlaneFinderLearner(SupervisedLearner):
             metrics[f"calibration/error_{unit}_least_sure_quarter"] = float(errors[least, i].mean())
             metrics[f"calibration/factor_{unit}"] = float(self._module.calibration[i])
         return metrics
+
+    @torch.no_grad()
+    def _answers(self, envs: Any, seed: int) -> tuple[Tensor, Tensor]:
+        """Play episodes in which the agent is never sure.
+
+        Returns:
+            The expected error before calibration, and the error, of the plane that the agent would answer at each look,
+            both of shape (n_looks, episodes, 2).
+        """
+        module, answers = self._module, []
+        observations, _ = reset_each(envs, seed)
+        optima = self._optima(envs)
+        for _ in range(self._finder.n_looks):
+            estimate = module.found(self._tensors(observations))
+            sure, unsure = (
+                module.actions(estimate._replace(expected=torch.full_like(estimate.expected, error)))
+                for error in (-math.inf, math.inf)
+            )
+            errors = module.geometry.errors(module.geometry.planes(sure[:, :4]), optima)
+            answers.append((estimate.expected / module.calibration, errors))
+            observations = envs.step(unsure.cpu().numpy())[0]
+        expected_at_looks, errors_at_looks = zip(*answers, strict=True)
+        return torch.stack(expected_at_looks), torch.stack(errors_at_looks)
 
     def _optima(self, envs: Any) -> Tensor:
         """Return the labelled planes of the current episodes, shape (num_envs, 4)."""

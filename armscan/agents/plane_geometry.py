@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from armscan.envs.actions import ActionBounds
-from armscan.envs.rules import ON_REWARD, Rules
+from armscan.envs.rules import ON_BUDGET, ON_STOP, Rules
 from armscan.errors import InvalidValueError, listed
 
 # Limits of a plane in the frame of another: sine of its tilt, and position across in mm.
@@ -128,13 +128,14 @@ def common_geometry(rules: Rules, n_looks: int) -> PlaneGeometry:
     Observations are centred on their slice's middle, so the mean middle serves slices of all sizes.
 
     Raises:
-        InvalidValueError: If the bounds differ between volumes, or an episode may end before all looks are taken.
+        InvalidValueError: If the bounds differ between volumes, or an episode may end before or after the last look.
     """
-    if rules.ends == ON_REWARD or rules.max_steps < n_looks:
+    fits = {ON_BUDGET: rules.max_steps == n_looks, ON_STOP: rules.max_steps >= n_looks}
+    if not fits.get(rules.ends):
         raise InvalidValueError(
             f"env.ends is {rules.ends!r} and env.max_steps is {rules.max_steps}, but a plane finder looks beside "
-            f"the plane, {n_looks} times: take env.ends=on_budget or on_stop, and at least "
-            f"env.max_steps={n_looks}"
+            f"the plane, {n_looks} times, and the last is its answer: take env.ends=on_budget and "
+            f"env.max_steps={n_looks}, or env.ends=on_stop"
         )
     bounds = set(rules.bounds.values())
     if len(bounds) > 1:

@@ -164,7 +164,7 @@ def _evaluate(
 ) -> None:
     """Evaluate an agent, track its metrics, and print them."""
     from armscan.evaluation import report_tables
-    from armscan.evaluation.track import evaluate_and_track
+    from armscan.evaluation.track import changed_rules, evaluate_and_track, notes_on
     from armscan.experiment.console import print_result_table, print_where_to_look
 
     report, file = evaluate_and_track(prepared, store, n_episodes=n_episodes, seed=seed, changes=changes, out=out)
@@ -173,9 +173,7 @@ def _evaluate(
         console.print(part)
     tables = report.tables()
     for label, table in tables.items():
-        notes = report.notes(label)
-        if label in prepared.own:
-            notes.append("the agent's run has used some of these volumes, so this is no result on new wrists")
+        notes = [*changed_rules(changes), *notes_on(prepared, report, label)]
         print_result_table(label, table, notes, how=label == [*tables][-1], of=label)
     print_where_to_look(Path.cwd(), store["uri"], files=(str(file),))
 

@@ -100,8 +100,10 @@ def draw_plane(
     draw = ImageDraw.Draw(picture)
     planes = [] if reference is None else [(reference.action, OPTIMUM_COLOUR, 1)]
     planes.append((plane, PLANE_COLOUR, 2))
-    # With fingers at low Y, as in phantoms.
-    seen_from = "fingers" if is_right_handed(volume) else "elbow"
+    axes, _ = (transform or RigidTransform()).plane_map(plane)
+    # With fingers at low Y, as in phantoms. A plane turned by more than 90°, or mirrored, shows its other side.
+    is_front = np.cross(axes[:, 0], axes[:, 2])[1] < 0.0
+    seen_from = "fingers" if is_right_handed(volume) == is_front else "elbow"
     frontal, sagittal = side_panels(volume, transform, planes, (_size_of(FRONTAL_BOX), _size_of(SAGITTAL_BOX)))
     for box, title, panel in (
         (SLICE_BOX, f"slice, palm up, from the {seen_from}", slice_panel(view, _size_of(SLICE_BOX))),

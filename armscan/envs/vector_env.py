@@ -189,7 +189,8 @@ class ArmscanVectorEnv(VectorEnv[Any, Any, Any]):
             # Gymnasium keeps strings in arrays of objects.
             infos[key] = values = values.astype(object) if values.dtype.kind == "U" else values
             if len(given) < len(episodes):
-                infos[key] = np.zeros((len(episodes), *values.shape[1:]), dtype=values.dtype)
+                missing = None if values.dtype == object else 0
+                infos[key] = np.full((len(episodes), *values.shape[1:]), missing, dtype=values.dtype)
                 infos[key][is_given] = values
             infos[f"_{key}"] = is_given.copy()
         return infos

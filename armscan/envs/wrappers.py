@@ -82,7 +82,8 @@ class FrameStack(_HistoryWrapper):
 
     def __init__(self, env: Env, stack: int, *, exclude: Collection[str] = ()) -> None:
         boxes = boxes_of(_checked(env, gym.Env).observation_space, "FrameStack")
-        super().__init__(env, FrameHistory(boxes, stack, exclude, 1), stack=stack, exclude=exclude)
+        # As a list, which JSON keeps, so that a spec read from JSON equals this one.
+        super().__init__(env, FrameHistory(boxes, stack, exclude, 1), stack=stack, exclude=list(exclude))
 
 
 class BestActionMemory(_HistoryWrapper):

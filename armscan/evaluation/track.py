@@ -58,6 +58,7 @@ def evaluate_and_track(
     upload_pending(client)
     limits = on_plane_of(source.config)
     of, data = source.run.run_id if source.run else source.name, data_name(prepared.data)
+    notes = [*changed_rules(changes), *prepared.notes]
     facts = {
         "of": of,
         "name": source.name,
@@ -65,12 +66,12 @@ def evaluate_and_track(
         "episodes_a_split": n_episodes,
         "seed": seed,
         "changes": dict(changes),
-        "notes": list(prepared.notes),
+        "notes": notes,
     }
     with TrackedRun.start(
         client,
         experiment_id,
-        name=f"evaluation: {source.name} on {data}",
+        name=", ".join([f"evaluation: {source.name} on {data}", *_assigned(changes)]),
         config={**to_plain(source.config), "evaluation": {**facts, "on_plane": [list(each) for each in limits]}},
         tags={EVALUATED_TAG: of},
         folder=FOLDER,
@@ -92,13 +93,31 @@ def evaluate_and_track(
         text = json.dumps(report.to_dict(), indent=1, allow_nan=False)
         atomic_write(file, text, follow_link=True)
         shown = own.with_suffix(".html")
-        sections = []
+        sections, described = [], [f"Note: {note}." for note in notes]
         for label, table in report.tables().items():
-            notes = "".join(f"<p>Note: {note}.</p>" for note in report.notes(label))
-            sections.append(f"<h2>{html.escape(label)}</h2>{table.html()}{notes}")
-        atomic_write(shown, page(tracked.name, "".join(sections), notes=prepared.notes))
+            of_label = [f"Note: {note}." for note in notes_on(prepared, report, label)]
+            paragraphs = "".join(f"<p>{note}</p>" for note in of_label)
+            sections.append(f"<h2>{html.escape(label)}</h2>{table.html()}{paragraphs}")
+            described += [f"### {label}", table.markdown(), *of_label]
+        atomic_write(shown, page(tracked.name, "".join(sections), notes=notes))
+        tracked.set_description("\n\n".join(described))
         tracked.log_files(file, shown)
     return report, file
+
+
+def notes_on(prepared: PreparedAgent, report: EvaluationReport, label: str) -> list[str]:
+    """Return the notes on the metrics of a group of volumes."""
+    used = "the agent's run has used some of these volumes, so this is no result on new wrists"
+    return [*report.notes(label), *([used] if label in prepared.own else [])]
+
+
+def changed_rules(changes: Mapping[str, Any]) -> list[str]:
+    """Return a note on the rules of the episodes that differ from the agent's configuration; none if none does."""
+    return [f"changed for this evaluation: {', '.join(_assigned(changes))}"] if changes else []
+
+
+def _assigned(changes: Mapping[str, Any]) -> list[str]:
+    return [f"{key}={value}" for key, value in changes.items()]
 
 
 def _store_of(source: EvaluatedAgent, store: Mapping[str, Any]) -> tuple[TrackingStore, str]:

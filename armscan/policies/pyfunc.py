@@ -23,13 +23,21 @@ class PyfuncPolicy(PythonModel):
         model_input: np.ndarray,
         params: dict[str, Any] | None = None,
     ) -> NDArray[np.float32]:
-        """Return the actions, shape (n, n_action), within [-1, 1]."""
+        """Return the actions, shape (n, n_action), within [-1, 1].
+
+        Raises:
+            ValueError: If an action is not finite, because the observations are not, or too large for 32 bits.
+        """
         with torch.no_grad():
             if isinstance(model_input, dict):
                 actions = self._policy({name: _tensor(part) for name, part in model_input.items()})
             else:
                 actions = self._policy(_tensor(model_input))
         answer: NDArray[np.float32] = actions.numpy()
+        if not np.isfinite(answer).all():
+            raise ValueError(
+                "the policy gives actions that are not finite: the observations must be finite 32-bit numbers"
+            )
         return answer
 
 

@@ -6,6 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import shorten
 from typing import Any, Self
 
 from armscan.config.command_hints import armscan_command
@@ -22,6 +23,8 @@ from armscan.utils.run_files import BASELINES_FILE, EVALUATION_FILE
 
 # Longest description that MLflow's databases accept.
 MAX_CHARS = 5000
+# Longest note of it; notes with the names of many volumes are cut.
+MAX_NOTE_CHARS = 300
 TAGGED = (*LEADING, "mean_distance_mm", "mean_distance_deg", "mean_dice")
 
 
@@ -58,12 +61,13 @@ class Card:
         tags: dict[str, str] = {}
         for title, report in reports.items():
             label = _label(report)
-            notes = "".join(f"\n\nNote: {note}." for note in (*report.facts.get("notes", ()), *report.notes(label)))
+            noted = (*report.facts.get("notes", ()), *report.notes(label))
+            notes = "".join(f"\n\nNote: {shorten(note, MAX_NOTE_CHARS, placeholder=' …')}." for note in noted)
             result = report.tables()[label].headline
             section = f"\n\n### {title}\n\n{result}\n\n{_table(report).markdown()}{notes}"
+            left_out = f"\n\nLeft out, because it is too long: {shorten(title, MAX_NOTE_CHARS, placeholder=' …')}."
             # If there is no room for both, the run's own evaluation stays.
-            if len(text + section) <= MAX_CHARS:
-                text += section
+            text += next(part for part in (section, left_out, "") if len(text + part) <= MAX_CHARS)
             # Tags cannot say that rules were changed: all are from the first evaluation without changes.
             tags = tags or ({} if report.facts.get("changes") else _tags(report))
         return cls(text, tags)

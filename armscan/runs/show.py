@@ -99,12 +99,13 @@ def _print_pairs(console: Console, title: str, pairs: dict[str, str], values: Co
 
 
 def _print_figures(console: Console, run: Run) -> None:
-    """Print the final evaluations, the baselines and the last validation; of a study, its result."""
+    """Print the final evaluations, the baselines and the last validation; the result of a study or an evaluation."""
     metrics, tags = run.data.metrics, run.data.tags
     of_study = STUDY_TAG in tags and AGENT_TAG not in tags
     result = tags.get(DESCRIPTION_TAG, "")
     is_ours = sha256(result.encode()) == tags.get(DESCRIPTION_SUM_TAG)
-    if of_study and TRIAL_TAG not in tags and is_ours:
+    has_result = EVALUATED_TAG in tags or (of_study and TRIAL_TAG not in tags)
+    if has_result and is_ours:
         console.print(Text("\nresult", style="bold"))
         console.print(Markdown("\n".join(map(printable, result.splitlines()))))
         return

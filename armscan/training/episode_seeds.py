@@ -1,4 +1,8 @@
-"""First seeds of the episodes for each purpose, a million apart, so that no episode serves two."""
+"""First seeds of the episodes for each purpose.
+
+The seed of the run is added. They are a million apart, so no episode serves two purposes if that seed and the number of
+episodes together are below a million.
+"""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ from armscan.sweeps.scheduling.race import MAX_SEEDS_FACTOR, Race, race
 from benchmarks.repository import PICTURES
 
 N_TRIALS, N_VALIDATION, N_TEST, N_JUDGING = 30, 8, 12, 5
-MIN_SEEDS, MEAN_SEEDS = 2, 6
+MIN_SEEDS, MEAN_SEEDS = 2, 12
 MAX_SEEDS = MAX_SEEDS_FACTOR * MEAN_SEEDS
 CONTROL, CONTROL_STEPS = -1, 2.6
 # Standard deviations in steps: between trainings, between volumes, and of a single trial's value.

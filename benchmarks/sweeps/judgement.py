@@ -27,7 +27,7 @@ from armscan.stats.paired import crossed_mean
 from armscan.sweeps.scheduling.race import MAX_SEEDS_FACTOR, race
 from benchmarks.tables import print_head, print_row
 
-N_CANDIDATES, N_VALIDATION, MIN_SEEDS, MEAN_SEEDS = 4, 8, 2, 6
+N_CANDIDATES, N_VALIDATION, MIN_SEEDS, MEAN_SEEDS = 4, 8, 2, 12
 MAX_SEEDS = MAX_SEEDS_FACTOR * MEAN_SEEDS
 # Standard deviations of the effects of trainings, of the effects of configurations on volumes, and of the residuals.
 OF_SEEDS, OF_VOLUMES, REST = 1.0, 0.4, 0.5

@@ -178,6 +178,19 @@ def test_errors_are_expected_with_a_schedule_too(phantom):
         assert each.expected_deg > 0.0
 
 
+def test_expected_errors_are_right_on_average_also_where_the_agent_stops_early(phantom):
+    size = {"num_envs": 16, "filters": (8, 8, 8), "hidden_sizes": (64,), "lr": 5e-3, "lr_end_factor": 1.0}
+    learner, _ = made(phantom, {"ends": "on_stop"}, sure_mm=8.0, sure_deg=4.0, **size)
+    learner.learn(9600)
+    learner._further_metrics(seed=5)
+    validation_env = EnvFactory(**RULES | {"ends": "on_stop"}).undeformed().make_env([phantom])
+    episodes = evaluate(learner, validation_env, n_episodes=96, seed=5).episodes
+    assert len({each.n_steps for each in episodes}) > 1
+    for unit in ("mm", "deg"):
+        expected, actual = ([getattr(each, f"{part}_{unit}") for each in episodes] for part in ("expected", "distance"))
+        assert np.mean(expected) == pytest.approx(np.mean(actual), rel=0.05)
+
+
 def test_expected_errors_are_right_on_average_where_they_were_calibrated(phantom):
     learner, _ = made(phantom)
     metrics = learner.learn(24)

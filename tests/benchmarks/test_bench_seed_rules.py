@@ -56,7 +56,7 @@ def test_ranks_of_equal_scores_drop_nobody():
 
 def test_budget_is_allocated_to_those_close_to_the_best():
     scores = scores_of([0.0, 0.2, -9.0])
-    found = allocation(2, 6, may_end=False)(scores)
+    found = allocation(2, 6, ends=None)(scores)
     assert set(found.n_trainings) == {18}
     close = (found.place < 2).mean()
     assert close == 1.0

@@ -157,10 +157,11 @@ def test_env_is_flat_by_itself_where_every_part_is_a_vector(wrist, variant, kind
     assert isinstance(make_mixed(wrist, variant).observation_space, kind)
 
 
-def test_spec_round_trip_through_text(data_folder):
+@pytest.mark.parametrize("excluded", [{}, {"stack_exclude": ["action"]}], ids=["none excluded", "action excluded"])
+def test_spec_round_trip_through_text(data_folder, excluded):
     """A spec can be text if its arguments can: a folder rather than volumes, names rather than objects."""
-    rules = {"observation": ["cluster", "slice"], "stack": 2, "stack_exclude": ["action"], "memory": 1, "max_steps": 3}
-    env = gym.make(armscan.ENV_ID, volumes=str(data_folder), **rules)
+    rules = {"observation": ["cluster", "slice"], "stack": 2, "memory": 1, "max_steps": 3}
+    env = gym.make(armscan.ENV_ID, volumes=str(data_folder), **rules, **excluded)
     spec = gym.envs.registration.EnvSpec.from_json(env.spec.to_json())
     assert spec == env.spec
     assert data_equivalence(play(gym.make(spec)), play(env), exact=True)

@@ -28,6 +28,7 @@ from armscan.envs.rendering import (
 )
 from armscan.errors import ResetNeededError
 from armscan.volumes import LabelVolume
+from armscan.volumes.rigid_transform import RigidTransform
 
 
 def n_shown(picture, colour):
@@ -144,6 +145,29 @@ def test_draw_plane_without_an_episode_names_no_step_and_no_optimal_plane(phanto
     written.clear()
     draw_plane(phantom, plane, view, reference=ReferencePlane(plane, "former plane"))
     assert {"former plane", "0.0 mm and 0.0°", "from the former plane"} <= set(written)
+
+
+@pytest.mark.parametrize(
+    ("rz_deg", "transform", "seen_from"),
+    [
+        (10.0, None, "fingers"),
+        (170.0, None, "elbow"),
+        (80.0, RigidTransform((20.0, 0.0)), "elbow"),
+        (100.0, RigidTransform((-20.0, 0.0)), "fingers"),
+    ],
+)
+@pytest.mark.parametrize("is_right_handed", [True, False])
+def test_title_says_from_where_the_slice_is_seen(phantom, monkeypatch, is_right_handed, rz_deg, transform, seen_from):
+    from PIL import ImageDraw
+
+    written = []
+    monkeypatch.setattr(ImageDraw.ImageDraw, "text", lambda _, __, text, **___: written.append(text))
+    direction = np.diag([1.0 if is_right_handed else -1.0, 1.0, 1.0])
+    volume = LabelVolume(phantom.labels, phantom.spacing, "wrist", phantom.optimal_action, direction=direction)
+    plane = ManipulatorAction((rz_deg, 0.0), (30.0, 40.0))
+    draw_plane(volume, plane, view_of(volume, plane), transform=transform)
+    other = {"fingers": "elbow", "elbow": "fingers"}
+    assert f"slice, palm up, from the {seen_from if is_right_handed else other[seen_from]}" in written
 
 
 def test_draw_plane_shortens_a_long_name(phantom, monkeypatch):

@@ -88,6 +88,8 @@ def test_vector_env_resets_only_those_that_are_marked(phantom):
         ended = step[2] | step[3]
         if ended.any():
             assert_same(ours.reset(options={"reset_mask": ended}), theirs.reset(options={"reset_mask": ended.copy()}))
+    marked = np.array([True, False, True])
+    assert_same(ours.reset(options={"reset_mask": marked}), theirs.reset(options={"reset_mask": marked.copy()}))
 
 
 @pytest.mark.parametrize("variant", VARIANTS, ids=str)

@@ -24,6 +24,10 @@ def test_evaluate_gives_figures_with_intervals_as_table_json_and_metrics(evaluat
     contents = written(tmp_path)
     assert contents["of"] == run_id
     assert contents["changes"] == {"max_steps": 3, "success_threshold": 0.04}
+    changed = "changed for this evaluation: max_steps=3, success_threshold=0.04"
+    assert printed.count(f"note: {changed}\n") == 3
+    assert contents["notes"] == [changed]
+    assert changed in next(tmp_path.glob("evaluations/*.html")).read_text()
     assert list(contents["splits"]) == ["training volumes", "validation volumes", "test volumes"]
     assert max(episode["n_steps"] for episode in contents["episodes"]["test volumes"]) <= 3
     assert list(contents["volumes"]["test volumes"]) == ["phantom-2000000"]
@@ -36,6 +40,10 @@ def test_evaluate_gives_figures_with_intervals_as_table_json_and_metrics(evaluat
         for group in ("test_volumes", "volume/phantom-2000000"):
             assert child.data.metrics[f"{group}/{figure}"] == pytest.approx(numbers["value"])
             assert child.data.metrics[f"{group}/{figure}_low"] == pytest.approx(numbers["low"])
+    assert child.info.run_name.endswith(", max_steps=3, success_threshold=0.04")
+    description = child.data.tags["mlflow.note.content"]
+    assert description.startswith(f"Note: {changed}.\n\n### training volumes\n\n")
+    assert "\n\n| with 95 % intervals | agent | random |" in description
     assert child.data.params["env.max_steps"] == "3"
     # By which `armscan runs list` knows the leading rate.
     assert child.data.params["evaluation.on_plane"].startswith("[[5.0, 10.0]")
@@ -45,6 +53,16 @@ def test_evaluate_gives_figures_with_intervals_as_table_json_and_metrics(evaluat
     assert not client.get_run(run_id).data.metrics
     code, _, errors = evaluate(contents["tracked_as"])
     assert (code, errors) == (2, f"error: run is {contents['tracked_as']!r}, but that is an evaluation, of {run_id}")
+
+
+def test_runs_show_has_the_notes_of_an_evaluation(evaluate, armscan, tmp_path):
+    run_id = tracked(tmp_path)
+    assert evaluate(run_id, "--episodes=1", "--max-steps=3")[0] == 0
+    code, printed, _ = armscan("runs", "show", written(tmp_path)["tracked_as"])
+    assert code == 0
+    assert "Note: changed for this evaluation: max_steps=3." in printed
+    assert "on plane, 5 mm 10°" in printed
+    assert "Note: 1 subject, fewer than 8" in " ".join(printed.split())
 
 
 def test_evaluate_makes_nothing_where_artifacts_are_read_only(evaluate, tmp_path, made_read_only):

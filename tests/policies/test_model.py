@@ -263,6 +263,16 @@ def test_run_keeps_no_policy_where_its_configuration_says_so(regression, tmp_pat
     assert [path.name for path in tmp_path.iterdir()] == ["config.yaml"]
 
 
+@pytest.mark.parametrize("value", [np.nan, 1e300])
+def test_model_refuses_observations_that_give_no_finite_action(made, value):
+    import mlflow.pyfunc
+
+    folder, arrays, _ = made["sac", "vector"]
+    model = mlflow.pyfunc.load_model(str(folder / "model"))
+    with np.errstate(over="ignore"), pytest.raises(ValueError, match="actions that are not finite"):
+        model.predict(np.full_like(arrays, value))
+
+
 def test_model_takes_memory_that_may_not_be_written_to(made):
     import mlflow.pyfunc
 

@@ -7,7 +7,7 @@ import pytest
 from armscan.agents.policy import SAMPLING
 from armscan.errors import TrackingError
 from armscan.evaluation import EvaluationReport
-from armscan.runs.model_card import Card
+from armscan.runs.model_card import MAX_CHARS, Card
 from armscan.tracking import TrackedRun, load_run
 from armscan.tracking.tags import EVALUATED_TAG
 from tests.support.stores import store_in
@@ -50,6 +50,19 @@ def test_card_has_the_latest_evaluation_that_has_kept_its_figures(keep, tmp_path
     assert "| steps, mean | 3.00 (2.00–4.00) |" in card.text
     # The tags are of the run's own evaluation, by its own rules.
     assert card.tags["test_volumes/mean_steps"] == "3"
+
+
+@pytest.mark.parametrize(("n_notes", "is_there"), [(2, True), (20, False)])
+def test_card_shortens_long_notes_and_says_which_evaluation_it_has_no_room_for(keep, tmp_path, n_notes, is_there):
+    run_id = keep("evaluation.json", json.dumps(OWN))
+    notes = ["the agent was trained on these volumes: " + ", ".join(f"wrist-{i}" for i in range(300))] * n_notes
+    latest = keep("figures.json", json.dumps(BY_COMMAND | {"notes": notes}), run_id)
+    text = card_of(run_id, tmp_path).text
+    assert len(text) <= MAX_CHARS
+    assert text.count("### at the end of the run") == 1
+    assert text.count("Note: the agent was trained on these volumes: wrist-0, ") == (n_notes if is_there else 0)
+    assert (f"### by evaluation {latest}" in text) is is_there
+    assert (f"Left out, because it is too long: by evaluation {latest}, on " in text) is not is_there
 
 
 @pytest.mark.parametrize(

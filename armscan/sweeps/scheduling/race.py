@@ -16,14 +16,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import stdtrit
+from scipy.special import ndtr, stdtrit
 
 from armscan.stats.bootstrap import UNKNOWN, UPPER, Estimate
 from armscan.utils.arrays import FloatArray
 
-# For an early end of the race: the level of the one-sided t tests of the leader against each other configuration, and
-# the seeds that the leader must have, because with fewer it may be lucky.
-END_LEVEL, LEADER_SEEDS = 0.95, 4
+# For an early end of the race: the largest expected loss from choosing the leader instead of another configuration, in
+# standard deviations of a score, and the seeds that the leader must have, because with fewer it may be lucky.
+END_LOSS, LEADER_SEEDS = 0.05, 5
 # Maximum number of seeds of a configuration, as a multiple of `mean_seeds`.
 MAX_SEEDS_FACTOR = 4
 # Prior degrees of freedom: the weight of the pooled variance in each configuration's variance, which two or three seeds
@@ -97,9 +97,9 @@ def race(scores: Scores, seeds: Sequence[int], *, min_seeds: int, mean_seeds: in
 
     All configurations are trained with the first `min_seeds` seeds. Each further round has one training for every three
     configurations that remain, at least two, where they most increase the probability of a correct selection. The
-    race is over when the configurations have `mean_seeds` seeds on average, when the leader is ahead of all others by
-    more than chance explains (one-sided t tests), or when one configuration remains. The one whose interval has the
-    highest lower end is chosen; the first of equal ones.
+    race is over when the configurations have `mean_seeds` seeds on average, when choosing the leader is expected to
+    lose little (see `is_decided`), or when one configuration remains. The one whose interval has the highest lower end
+    is chosen; the first of equal ones.
 
     Args:
         scores: Score of each finished training by configuration and seed, the higher the better. NaN for a failed
@@ -196,7 +196,11 @@ def half_widths(variances: FloatArray, n_seeds: Any) -> FloatArray:
 
 
 def is_decided(means: FloatArray, variances: FloatArray, n_seeds: Counts) -> NDArray[np.bool_]:
-    """Return whether the leader has enough seeds and is ahead of all others by more than chance explains, shape (...).
+    """Return whether the leader has enough seeds, and choosing it is expected to lose little, shape (...).
+
+    The expected loss, or opportunity cost, is the mean of max(0, d), where d is the unknown difference of another
+    configuration's true score from the leader's, taken as normal. It must be small for each other configuration, as a
+    share of the standard deviation of a score (Branke, Chick and Schmidt 2007, doi:10.1287/mnsc.1070.0721).
 
     Args:
         means: Mean score of each configuration, shape (..., configurations).
@@ -205,9 +209,12 @@ def is_decided(means: FloatArray, variances: FloatArray, n_seeds: Counts) -> NDA
     """
     leader = means.argmax(axis=-1)[..., np.newaxis]
     mean, of_mean, n_leader = (np.take_along_axis(each, leader, -1) for each in (means, variances / n_seeds, n_seeds))
-    df = PRIOR_DF + np.minimum(n_seeds, n_leader) - 1
-    is_behind = mean - means > stdtrit(df, END_LEVEL) * np.sqrt(of_mean + variances / n_seeds)
-    return np.asarray((n_leader[..., 0] >= LEADER_SEEDS) & (is_behind.sum(axis=-1) == means.shape[-1] - 1))
+    spread = np.sqrt(of_mean + variances / n_seeds)
+    ahead = (mean - means) / np.maximum(spread, MIN_GAP)
+    losses = spread * (np.exp(-(ahead**2) / 2) / math.sqrt(2 * math.pi) - ahead * ndtr(-ahead))
+    is_small = losses <= END_LOSS * np.sqrt(variances.mean(axis=-1, keepdims=True))
+    is_leader = np.arange(means.shape[-1]) == leader
+    return np.asarray((n_leader[..., 0] >= LEADER_SEEDS) & (is_small | is_leader).all(axis=-1))
 
 
 def allocate(means: FloatArray, variances: FloatArray, n_seeds: Counts, n_more: int, *, most: int) -> Counts:

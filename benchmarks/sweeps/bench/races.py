@@ -11,19 +11,29 @@ from armscan.stats.bootstrap import Estimate
 from armscan.utils.arrays import FloatArray
 from benchmarks.sweeps.bench.importance import estimate_of
 from benchmarks.sweeps.bench.replay import Rule, scores_of, search
-from benchmarks.sweeps.bench.seed_rules import MAX_SEEDS, SeedRule, allocation, fixed, friedman_race, halving, t_race
+from benchmarks.sweeps.bench.seed_rules import (
+    MAX_SEEDS,
+    SeedRule,
+    allocation,
+    fixed,
+    friedman_race,
+    halving,
+    is_ahead,
+    t_race,
+)
 from benchmarks.sweeps.bench.surrogate import SimulatedConfig, Surrogate
 
-N_SEEDS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 24)
+N_SEEDS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 24, 32)
 FIXED: Mapping[str, SeedRule] = {f"{n_seeds} seeds each": fixed(n_seeds) for n_seeds in N_SEEDS}
 # Seeds of all configurations at first, and on average; the first pair is armscan's default.
-ALLOCATIONS = ((2, 6), (2, 4), (3, 6), (2, 8))
+ALLOCATIONS = ((2, 12), (2, 6), (2, 8), (2, 16), (3, 12))
 # Fewest and most seeds, and the confidence at which a configuration is dropped.
 T_RACES = ((3, 8, 0.9), (2, 6, 0.8), (5, 10, 0.9), (4, 16, 0.95))
 RACES: Mapping[str, SeedRule] = {
     **{f"allocation, {low} seeds, then {mean} on average": allocation(low, mean) for low, mean in ALLOCATIONS},
-    "allocation, 2 seeds, then 6 on average, one training at a time": allocation(2, 6, n_at_once=1),
-    "allocation, 2 seeds, then 6 on average, never ends early": allocation(2, 6, may_end=False),
+    "allocation, 2 seeds, then 12 on average, one training at a time": allocation(2, 12, n_at_once=1),
+    "allocation, 2 seeds, then 6 on average, never ends early": allocation(2, 6, ends=None),
+    "allocation, 2 seeds, then 6 on average, ends by t tests": allocation(2, 6, ends=is_ahead),
     **{f"t test at {level:.0%}, {low} to {high} seeds": t_race(low, high, level) for low, high, level in T_RACES},
     **{f"Friedman's test, {low} to 16 seeds": friedman_race(low, 16) for low in (3, 5)},
     **{f"halving, from {low} seeds": halving(low) for low in (2, 3)},

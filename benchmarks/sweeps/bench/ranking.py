@@ -44,9 +44,9 @@ class Final(NamedTuple):
 # Rules are ranked without the control: chosen in place of bad candidates, it hides what a sampler finds.
 FINALS = {
     "fixed": Final(5, 5, has_control=False),
-    "race": Final(2, 6, has_control=False),
-    "control": Final(2, 6),
-    "eight": Final(2, 6, top_k=8),
+    "race": Final(2, 12, has_control=False),
+    "control": Final(2, 12),
+    "eight": Final(2, 12, top_k=8),
 }
 
 

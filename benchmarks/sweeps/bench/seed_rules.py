@@ -13,6 +13,7 @@ from scipy.stats import rankdata
 
 from armscan.sweeps.scheduling.race import (
     PRIOR_DF,
+    Counts,
     allocate,
     half_widths,
     is_decided,
@@ -23,9 +24,11 @@ from armscan.sweeps.scheduling.race import (
 from armscan.utils.arrays import FloatArray
 
 # Seeds that are simulated for each configuration: no rule takes more.
-MAX_SEEDS = 24
+MAX_SEEDS = 48
 # Confidence of Friedman's test, as in irace.
 FRIEDMAN_LEVEL = 0.95
+# Confidence of the t tests that ended armscan's race formerly, and the seeds that its leader had to have.
+T_LEVEL, T_LEADER_SEEDS = 0.95, 4
 Mask = NDArray[np.bool_]
 
 
@@ -45,6 +48,8 @@ class Chosen(NamedTuple):
 SeedRule = Callable[[FloatArray], Chosen]
 # Maps the scores of the seeds so far, and the configurations that are in, to the configurations that stay in.
 Drop = Callable[[FloatArray, Mask], Mask]
+# Maps means, variances and seeds of configurations to whether the race is over.
+Ends = Callable[[FloatArray, FloatArray, Counts], Mask]
 
 
 def fixed(n_seeds: int) -> SeedRule:
@@ -78,14 +83,25 @@ def halving(min_seeds: int) -> SeedRule:
     return partial(_raced, rounds=[*rounds, MAX_SEEDS], drop=_worse_half)
 
 
-def allocation(min_seeds: int, mean_seeds: int, *, n_at_once: int | None = None, may_end: bool = True) -> SeedRule:
+def is_ahead(means: FloatArray, variances: FloatArray, n_seeds: Counts) -> Mask:
+    """Return whether the leader passes one-sided t tests against all others; see `is_decided` for the arguments."""
+    leader = means.argmax(axis=-1)[..., np.newaxis]
+    mean, of_mean, n_leader = (np.take_along_axis(each, leader, -1) for each in (means, variances / n_seeds, n_seeds))
+    df = PRIOR_DF + np.minimum(n_seeds, n_leader) - 1
+    is_behind = mean - means > stdtrit(df, T_LEVEL) * np.sqrt(of_mean + variances / n_seeds)
+    return np.asarray((n_leader[..., 0] >= T_LEADER_SEEDS) & (is_behind.sum(axis=-1) == means.shape[-1] - 1))
+
+
+def allocation(
+    min_seeds: int, mean_seeds: int, *, n_at_once: int | None = None, ends: Ends | None = is_decided
+) -> SeedRule:
     """Return the race of armscan, see `armscan.sweeps.scheduling.race.race`, with at most the seeds that are simulated.
 
     Args:
         min_seeds: Seeds of all configurations, 2 or more.
         mean_seeds: Seeds of a configuration on average, at most.
         n_at_once: Trainings of a round after the first. Default: None, as many as in armscan.
-        may_end: Whether it may end before its budget is used, see `is_decided`. Default: True, as in armscan.
+        ends: Whether it ends before its budget is used; None for never. Default: `is_decided`, as in armscan.
     """
 
     def choose(scores: FloatArray) -> Chosen:
@@ -94,8 +110,8 @@ def allocation(min_seeds: int, mean_seeds: int, *, n_at_once: int | None = None,
         left = (mean_seeds - min_seeds) * n_configs
         while left > 0 and not is_over.all():
             means, variances = moments(scores, n_seeds)
-            if may_end:
-                is_over |= is_decided(means, variances, n_seeds)
+            if ends is not None:
+                is_over |= ends(means, variances, n_seeds)
             n_more = min(n_at_once or round_size(n_configs), left)
             more = allocate(means, variances, n_seeds, n_more, most=n_most)
             n_seeds, left = np.where(is_over[:, np.newaxis], n_seeds, more), left - n_more

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.stats import t
 
 from armscan.sweeps.scheduling.race import (
-    END_LEVEL,
+    END_LOSS,
     LEADER_SEEDS,
     MAX_SEEDS_FACTOR,
     PRIOR_DF,
@@ -80,10 +80,10 @@ def test_race_begins_with_few_seeds_of_all_and_continues_with_those_that_may_be_
 
 def test_race_ends_early_once_the_leader_has_enough_seeds_and_is_far_ahead():
     table = {-1: [9.0, 9.2] * 6, 4: [1.0, 1.2] * 6, 7: [1.1, 0.9] * 6}
-    ended, trained = run(table, (2, 4), lambda missing: missing[0])
+    ended, trained = run(table, (2, 6), lambda missing: missing[0])
     assert ended.chosen == -1
     assert [number for number, _ in trained].count(-1) == LEADER_SEEDS
-    assert len(trained) < 12
+    assert len(trained) < 18
 
 
 def test_same_seeds_for_all_take_one_round():
@@ -161,17 +161,27 @@ def test_variances_are_shrunk_towards_their_mean_as_in_moderated_t_statistics():
     assert half_widths(variances, n_seeds) == pytest.approx(widths)
 
 
-def test_race_is_decided_where_the_leader_passes_every_t_test():
+def test_race_is_decided_where_choosing_the_leader_is_expected_to_lose_little():
     n_seeds, variances = np.array([LEADER_SEEDS + 2, LEADER_SEEDS, 3]), np.array([1.0, 2.0, 0.5])
-    least = [
-        t.ppf(END_LEVEL, PRIOR_DF + min(n_seeds[0], n) - 1) * (variances[0] / n_seeds[0] + variance / n) ** 0.5
-        for n, variance in zip(n_seeds[1:], variances[1:], strict=True)
-    ]
-    for factors, expected in (((1.01, 1.01), True), ((0.99, 1.01), False), ((1.01, 0.99), False)):
-        means = np.array([0.0, *(-gap * factor for gap, factor in zip(least, factors, strict=True))])
-        assert bool(is_decided(means, variances, n_seeds)) is expected
+    rng = np.random.default_rng(0)
+    for gaps in ((1.0, 0.8), (2.0, 1.5), (2.5, 0.5), (0.5, 2.5), (1.2, 1.2)):
+        means = np.array([0.0, *(-gap for gap in gaps)])
+        true = means + (variances / n_seeds) ** 0.5 * rng.standard_normal((1_000_000, 3))
+        losses = np.maximum(0.0, true[:, 1:] - true[:, :1]).mean(axis=0) / variances.mean() ** 0.5
+        assert bool(is_decided(means, variances, n_seeds)) is bool((losses <= END_LOSS).all()), gaps
+        # Neither the unit of the scores nor their zero matters.
+        assert is_decided(3e9 + 1e-3 * means, 1e-6 * variances, n_seeds) == is_decided(means, variances, n_seeds)
     # However far ahead, a leader with few seeds decides nothing.
     assert not is_decided(np.array([9e9, 0.0, 0.0]), variances, np.array([LEADER_SEEDS - 1, 9, 9]))
+
+
+def test_race_is_decided_once_equal_configurations_have_many_seeds_or_no_noise():
+    means, variances = np.zeros(3), np.ones(3)
+    # The expected loss between equals is the spread of their difference over the square root of 2 pi.
+    n_enough = math.ceil(2 / (2 * math.pi * END_LOSS**2))
+    assert not is_decided(means, variances, np.full(3, n_enough - 1))
+    assert is_decided(means, variances, np.full(3, n_enough))
+    assert is_decided(means, np.zeros(3), np.full(3, LEADER_SEEDS))
 
 
 @pytest.mark.parametrize(("n_configurations", "expected"), [(2, 2), (4, 2), (8, 2), (9, 3), (13, 4)])
