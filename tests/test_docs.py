@@ -98,7 +98,7 @@ def in_a_folder(tmp_path, monkeypatch):
 
 @pytest.mark.full
 @pytest.mark.parametrize(("page", "words"), COMMANDS)
-def test_commands_of_pages_are_good_words(page, words, in_a_folder):
+def test_commands_of_pages_are_valid(page, words, in_a_folder):
     from armscan.config.compose import compose
 
     write_files(page, in_a_folder)

@@ -241,7 +241,7 @@ def test_agents_that_do_not_learn_are_evaluated_and_tracked_side_by_side(tmp_pat
 
 @pytest.mark.full
 @pytest.mark.usefixtures("database")
-def test_run_on_labelmap_files(tmp_path, data_folder):
+def test_run_trains_on_labelmap_files(tmp_path, data_folder):
     arguments = ["data=nifti", f"data.path={data_folder}", *(word for word in SMALL if not word.startswith("data."))]
     ended = armscan_run(*arguments, cwd=tmp_path)
     assert ended.returncode == 0, ended.stderr
@@ -353,7 +353,7 @@ def test_run_is_refused_a_folder_where_it_would_overwrite_files_of_others(answer
     assert there == {f"mine/{name}", "mine/tracking/notes.txt"}
 
 
-def test_folder_of_an_earlier_run_can_be_used_again_and_files_of_others_are_nobodys(answer, tmp_path):
+def test_folder_of_an_earlier_run_can_be_used_again_and_files_of_others_are_not_uploaded(answer, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.json").write_text("precious")
     assert answer("hydra.run.dir=mine", *SMALL)[0] == 0

@@ -133,9 +133,9 @@ def common_geometry(rules: Rules, n_looks: int) -> PlaneGeometry:
     fits = {ON_BUDGET: rules.max_steps == n_looks, ON_STOP: rules.max_steps >= n_looks}
     if not fits.get(rules.ends):
         raise InvalidValueError(
-            f"env.ends is {rules.ends!r} and env.max_steps is {rules.max_steps}, but a plane finder looks beside "
-            f"the plane, {n_looks} times, and the last is its answer: take env.ends=on_budget and "
-            f"env.max_steps={n_looks}, or env.ends=on_stop"
+            f"env.ends is {rules.ends!r} and env.max_steps is {rules.max_steps}, but a plane finder takes {n_looks} "
+            f"looks, and the last one is its answer: take env.ends=on_budget and env.max_steps={n_looks}, or "
+            f"env.ends=on_stop and at least env.max_steps={n_looks}"
         )
     bounds = set(rules.bounds.values())
     if len(bounds) > 1:

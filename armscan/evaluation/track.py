@@ -112,7 +112,7 @@ def notes_on(prepared: PreparedAgent, report: EvaluationReport, label: str) -> l
 
 
 def changed_rules(changes: Mapping[str, Any]) -> list[str]:
-    """Return a note on the rules of the episodes that differ from the agent's configuration; none if none does."""
+    """Return the notes on rules that differ from the agent's configuration: one, or none if no rule was changed."""
     return [f"changed for this evaluation: {', '.join(_assigned(changes))}"] if changes else []
 
 

@@ -1,7 +1,7 @@
 """First seeds of the episodes for each purpose.
 
-The seed of the run is added. They are a million apart, so no episode serves two purposes if that seed and the number of
-episodes together are below a million.
+The run's seed is added to each. First seeds are a million apart, so no episode serves two purposes as long as the sum
+of the run's seed and the number of episodes is below a million.
 """
 
 from __future__ import annotations

@@ -65,7 +65,7 @@ def test_sweep_visits_every_plane_once_from_the_middle_outward(phantom):
 
 @pytest.mark.parametrize("bound_mm", [0.3, 0.7, 30.0, 99.99999999999999, 216.00000858306885, 1e6])
 @pytest.mark.parametrize("n_steps", [1, 2, 3, 7, 12])
-def test_sweep_whose_last_step_ends_on_the_ends_reaches_them(phantom, bound_mm, n_steps):
+def test_sweep_includes_both_ends_where_its_steps_divide_the_range(phantom, bound_mm, n_steps):
     step_mm = bound_mm / (2 * n_steps)
     bounds = ActionBounds((90.0, 45.0), (bound_mm, bound_mm))
     swept = agent_of(Exhaustive(step_mm=step_mm), phantom).planes(bounds)

@@ -178,7 +178,7 @@ def test_errors_are_expected_with_a_schedule_too(phantom):
         assert each.expected_deg > 0.0
 
 
-def test_expected_errors_are_right_on_average_also_where_the_agent_stops_early(phantom):
+def test_expected_errors_are_right_on_average_even_where_the_agent_stops_early(phantom):
     size = {"num_envs": 16, "filters": (8, 8, 8), "hidden_sizes": (64,), "lr": 5e-3, "lr_end_factor": 1.0}
     learner, _ = made(phantom, {"ends": "on_stop"}, sure_mm=8.0, sure_deg=4.0, **size)
     learner.learn(9600)

@@ -46,7 +46,7 @@ def test_command_explains_itself_and_each_option(path, capsys):
 
 
 @pytest.mark.parametrize("words", EXAMPLES, ids=" ".join)
-def test_examples_are_good_words(words, tmp_path, monkeypatch):
+def test_examples_are_valid_arguments(words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for folder in ("outputs", "studies/sac_y"):
         (tmp_path / folder).mkdir(parents=True)
@@ -70,7 +70,7 @@ def test_command_refuses_an_unknown_option_in_one_line(path, capsys):
         (["report", "--study"], "error: Option '--study' requires an argument.\n"),
     ],
 )
-def test_program_refuses_bad_words_in_one_line(words, line, capsys):
+def test_program_refuses_invalid_arguments_in_one_line(words, line, capsys):
     assert main(words) == 2
     assert capsys.readouterr() == ("", line)
 

@@ -115,7 +115,7 @@ def test_policy_is_registered_with_the_figures_of_its_run(answer, armscan, tmp_p
     assert {"test_volumes/success_rate", "training_volumes/success_rate"} <= third.tags.keys()
 
 
-def test_bad_words_are_answered_in_one_line_and_change_nothing(answer, tmp_path):
+def test_invalid_arguments_are_answered_in_one_line_and_change_nothing(answer, tmp_path):
     run_id = tracked(tmp_path)
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "mine.txt").write_text("precious")

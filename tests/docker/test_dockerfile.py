@@ -19,7 +19,7 @@ def test_hadolint_finds_nothing_and_ignores_nothing():
     assert linted.returncode == 0, linted.stdout
 
 
-def test_image_is_slim_pinned_and_nobodys_root():
+def test_image_is_slim_and_pinned_and_does_not_run_as_root():
     bases = {words.split()[0] for name, words in instructions() if name == "FROM"}
     assert bases == {"python:3.11-slim-bookworm"}
     image = read_image()

@@ -45,7 +45,7 @@ def test_job_is_indexed_and_repeats_only_what_may_help(job):
     assert (ended["action"], ended["onExitCodes"]) == ("FailIndex", {"operator": "In", "values": [1]})
 
 
-def test_pod_is_nobodys_root_and_fits_the_image(pod):
+def test_pod_does_not_run_as_root_and_fits_the_image(pod):
     # Required for counting failures by index.
     assert pod["restartPolicy"] == "Never"
     assert {"hostNetwork", "hostname"} & pod.keys() == set()

@@ -51,7 +51,7 @@ def test_bounds_refuse_negative_translations():
     ("projection", "indices"),
     [("x", (2,)), ("y", (3,)), ("xy", (2, 3)), ("zy", (0, 3)), ("full", (0, 1, 2, 3)), (["ty", "rx"], (1, 3))],
 )
-def test_free_components(projection, indices):
+def test_projection_names_its_free_components(projection, indices):
     assert free_components(projection) == indices
 
 

@@ -146,7 +146,7 @@ def test_env_conforms_where_the_last_plane_is_judged(wrist, variant):
     assert data_equivalence(play(pickle.loads(pickle.dumps(env))), play(env), exact=True)
 
 
-def test_env_conforms_where_it_is_drawn(wrist, unseen_windows):
+def test_env_conforms_where_it_is_rendered(wrist, unseen_windows):
     """Check pictures as the checker does; this check costs too much to run over every combination."""
     check_env(Presented(make_mixed(wrist, "images", render_mode="rgb_array")))
     check_env(gym.make(armscan.ENV_ID, volumes=[wrist], render_mode="rgb_array").unwrapped)

@@ -10,7 +10,7 @@ from tests.test_run import SMALL
 
 
 @pytest.mark.full
-def test_figures_are_shown_before_the_film_and_the_export(tmp_path, monkeypatch, capsys):
+def test_figures_are_shown_before_the_video_and_the_export(tmp_path, monkeypatch, capsys):
     printed_before = []
 
     def noted(*_arguments, **_options):

@@ -36,7 +36,7 @@ def test_nothing_is_touched_without_apply_and_the_command_that_does_it_is_told(a
     assert (snapshot(), ids_in(tmp_path)) == before
 
 
-def test_checkpoints_leave_everything_else(answer, make_run, snapshot, tmp_path):
+def test_pruning_checkpoints_leaves_everything_else(answer, make_run, snapshot, tmp_path):
     run_id = make_run()
     before = snapshot()
     code, printed, _ = answer("prune", "checkpoints", "--apply")
@@ -49,7 +49,7 @@ def test_checkpoints_leave_everything_else(answer, make_run, snapshot, tmp_path)
     assert f"{run_id[:8]} stays: its folder holds no checkpoint of it" in printed
 
 
-def test_folders_leave_the_store(answer, make_run, tmp_path):
+def test_pruning_folders_leaves_the_store(answer, make_run, tmp_path):
     run_id = make_run()
     assert answer("prune", "folders", "--apply")[0] == 0
     assert not (tmp_path / "outputs" / "tiny").exists()

@@ -77,7 +77,7 @@ def test_what_a_run_could_not_upload_the_next_start_uploads(server, opened, tmp_
     assert not {tracked.run_id, going_on.run_id} & notes().keys()
 
 
-def test_run_goes_on_while_the_server_is_away_and_nothing_is_lost_or_there_twice(
+def test_run_goes_on_while_the_server_is_unavailable_and_nothing_is_lost_or_there_twice(
     server, opened, tmp_path, capfd, monkeypatch
 ):
     tracked = begun(opened, tmp_path)
@@ -176,7 +176,7 @@ def test_upload_whose_answer_is_lost_is_not_there_twice(server, opened, tmp_path
     assert histories(server.uri, tracked.run_id) == {"x": [(7, 1.0)], "z": [(7, 2.0)]}
 
 
-def test_run_that_is_made_while_the_server_goes_away_is_made_once(server, opened, tmp_path, monkeypatch):
+def test_run_that_is_made_while_the_server_becomes_unavailable_is_made_once(server, opened, tmp_path, monkeypatch):
     _, experiment_id = opened
     store, _ = open_store(server.uri, experiment="test", artifacts="-", wait_s=60.0, retry_s=60.0)
     create, asked = store.mlflow.create_run, []

@@ -55,7 +55,7 @@ def test_slid_into_leaves_a_plane_within_the_bounds_where_it_is():
 
 
 @pytest.mark.parametrize(("angle", "wrapped"), [(0, 0), (180, 180), (-180, 180), (190, -170), (-361, -1), (540, 180)])
-def test_wrapped_deg(angle, wrapped):
+def test_angle_is_wrapped_into_its_range(angle, wrapped):
     assert wrap_deg(angle) == pytest.approx(wrapped)
 
 

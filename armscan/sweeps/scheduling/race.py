@@ -198,9 +198,9 @@ def half_widths(variances: FloatArray, n_seeds: Any) -> FloatArray:
 def is_decided(means: FloatArray, variances: FloatArray, n_seeds: Counts) -> NDArray[np.bool_]:
     """Return whether the leader has enough seeds, and choosing it is expected to lose little, shape (...).
 
-    The expected loss, or opportunity cost, is the mean of max(0, d), where d is the unknown difference of another
-    configuration's true score from the leader's, taken as normal. It must be small for each other configuration, as a
-    share of the standard deviation of a score (Branke, Chick and Schmidt 2007, doi:10.1287/mnsc.1070.0721).
+    The expected loss, or expected opportunity cost, is the mean of max(0, d), where d is another configuration's true
+    score minus the leader's, assumed to be normally distributed. For each other configuration, it must be at most
+    `END_LOSS` standard deviations of a score (Branke, Chick and Schmidt 2007, doi:10.1287/mnsc.1070.0721).
 
     Args:
         means: Mean score of each configuration, shape (..., configurations).

@@ -101,7 +101,8 @@ def allocation(
         min_seeds: Seeds of all configurations, 2 or more.
         mean_seeds: Seeds of a configuration on average, at most.
         n_at_once: Trainings of a round after the first. Default: None, as many as in armscan.
-        ends: Whether it ends before its budget is used; None for never. Default: `is_decided`, as in armscan.
+        ends: Function that decides whether the race ends before its budget is used. None: it never does. Default:
+            `is_decided`, as in armscan.
     """
 
     def choose(scores: FloatArray) -> Chosen:

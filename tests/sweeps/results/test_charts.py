@@ -12,7 +12,7 @@ from armscan.reports.chart_style import BLUE, GREY
 from armscan.sweeps.results.charts import _history, _slice, charts_of
 
 
-def test_best_so_far_is_of_trials_that_keep_all_constraints():
+def test_best_so_far_is_of_trials_that_satisfy_all_constraints():
     study = optuna.create_study()
     for value, violation in ((3.0, -0.1), (1.0, 0.5), (2.0, 0.0)):
         study.add_trial(create_trial(value=value, constraints={"training_s <= 60": violation}))

@@ -131,7 +131,7 @@ def test_unsteady_configuration_loses_against_a_steady_one_that_is_hardly_worse(
     assert run(table, (2, 4), lambda missing: missing[0])[0].chosen == 5
 
 
-def test_seeds_are_allotted_as_in_the_optimal_computing_budget_allocation():
+def test_seeds_are_allocated_as_in_the_optimal_computing_budget_allocation():
     """Shares in proportion to variance over squared gap; the leader's balances them (Chen et al. 2000)."""
     means, variances = np.array([5.0, 4.0, 3.0]), np.array([1.0, 1.0, 4.0])
     # 1 / 1 and 4 / 4, so equal shares, and the square root of 1 + 1 / 4 times that for the leader.

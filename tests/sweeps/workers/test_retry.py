@@ -241,14 +241,14 @@ def test_thread_without_retry_is_told_at_once(open_scheduler, postgres, capsys):
         assert scheduler.state().all == ()
 
 
-def test_worker_that_is_opened_while_the_server_is_away_waits_for_it(postgres):
+def test_worker_that_is_opened_while_the_server_is_unavailable_waits_for_it(postgres):
     uri = postgres.make_database()
     postgres.stop()
     threading.Timer(1.0, postgres.start).start()
     assert optuna.get_all_study_names(open_storage(uri, retry=True).optuna) == []
 
 
-def test_worker_that_is_told_to_leave_while_the_storage_is_away_leaves_soon(open_scheduler, postgres, monkeypatch):
+def test_worker_told_to_leave_while_the_storage_is_unavailable_leaves_soon(open_scheduler, postgres, monkeypatch):
     monkeypatch.setattr(lease, "REQUEUE_TIMEOUT_S", 1.0)
     scheduler, told, left = open_scheduler(), threading.Event(), threading.Event()
     heartbeat = Heartbeat(scheduler, "a", should_leave=told.is_set, leave=left.set, on_death=pytest.fail)

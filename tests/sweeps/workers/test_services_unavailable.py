@@ -87,7 +87,7 @@ def assert_complete(storage_uri, tracking_uri, n_trials):
 
 
 @pytest.mark.parametrize("away_s", [6.0, pytest.param(30.0, marks=pytest.mark.slow)], ids=lambda away_s: f"{away_s:g}s")
-def test_study_loses_nothing_while_its_services_are_away(services, tmp_path, away_s):
+def test_study_loses_nothing_while_its_services_are_unavailable(services, tmp_path, away_s):
     postgres, server = services
     folder, storage_uri = tmp_path / "here", postgres.make_database()
     with study(folder, storage_uri, server.uri, "study.n_trials=2") as process:
