@@ -15,7 +15,7 @@ from armscan.reports.html import chart, table
 from armscan.stats.bootstrap import Estimate
 from armscan.sweeps.results.final_results import bounds_in
 from armscan.sweeps.results.judgement import Judgement
-from armscan.sweeps.scheduling.race import END_LOSS, Race
+from armscan.sweeps.scheduling.race import END_LOSS, LEADER_SEEDS, Race
 from armscan.sweeps.scheduling.state import CONTROL, StudyState
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.attribute_names import OBJECTIVES
@@ -137,8 +137,9 @@ def decision_section(
     n_seeds = counted(settings.min_seeds, "seed")
     further = (
         "Further seeds go, in rounds, to the candidates where they most increase the probability of a correct "
-        f"selection. The race ends at {settings.mean_seeds} seeds of each on average, or as soon as the expected loss "
-        f"from choosing the leader is at most {100 * END_LOSS:.0f} % of the standard deviation between seeds. "
+        f"selection. The race ends at {settings.mean_seeds} seeds of each on average, if one candidate is left, or "
+        f"once the leader has {LEADER_SEEDS} seeds and the expected loss from choosing it is at most "
+        f"{100 * END_LOSS:.0f} % of the standard deviation between seeds. "
     )
     steps = [
         f"<b>Search</b>: {counted(len(searched.finished), 'trial')}, {searched.n_pruned} of them pruned. Candidates "

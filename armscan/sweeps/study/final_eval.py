@@ -12,6 +12,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import takewhile
 from statistics import fmean
 
 import optuna
@@ -114,15 +115,19 @@ class FinalEvaluation:
             scores: Result of `scores`. Default: None, the current scores.
         """
         scores, settings = self.scores() if scores is None else scores, self.settings
-        run = partial(race, seeds=self.selection_seeds, min_seeds=settings.min_seeds)
-        first_round, violated = set(self.selection_seeds[: settings.min_seeds]), self.violated()
+        seeds, first_round = self.selection_seeds, set(self.selection_seeds[: settings.min_seeds])
+        run = partial(race, seeds=seeds, min_seeds=settings.min_seeds, mean_seeds=settings.mean_seeds)
+        violated = self.violated()
         violating = {number: of for number, of in scores.items() if number in violated and of.keys() >= first_round}
         if not violating or len(violating) == len(scores):
-            return run(scores, mean_seeds=settings.mean_seeds)
-        alone = run(violating, mean_seeds=settings.min_seeds).standings
-        withdrawn = {number: replace(standing, is_withdrawn=True) for number, standing in alone.items()}
-        others = {number: of for number, of in scores.items() if number not in violating}
-        found = run(others, mean_seeds=settings.mean_seeds)
+            return run(scores)
+        withdrawn = {}
+        for number, of in violating.items():
+            # Over all of its trainings, as its constraints are.
+            n_seeds = len([*takewhile(of.__contains__, seeds)])
+            standing = race({number: of}, seeds, min_seeds=n_seeds, mean_seeds=n_seeds).standings[number]
+            withdrawn[number] = replace(standing, is_withdrawn=True)
+        found = run({number: of for number, of in scores.items() if number not in violating})
         standings = {**withdrawn, **found.standings}
         return replace(found, standings={number: standings[number] for number in scores})
 

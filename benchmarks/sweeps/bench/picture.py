@@ -15,7 +15,8 @@ from benchmarks.sweeps.bench.importance import Key
 from benchmarks.sweeps.bench.races import Choices
 from benchmarks.sweeps.bench.ranking import PRUNERS, curve_of
 
-MARKERS = "os^Dv<>pPX*hHd"
+# One for each of `RACES`.
+MARKERS = "os^Dv<>pPX*hHd8+"
 Races = tuple[Sequence[Choices], Mapping[str, Choices]]
 
 

@@ -466,10 +466,10 @@ def test_control_that_violates_a_constraint_is_judged_but_not_chosen(storage_uri
 
 def test_control_that_violates_a_constraint_leaves_the_race_after_its_first_round(storage_uri):
     close = {CONTROL: 1.5, 0: 5.0, 1: 4.9, 2: 9.0}
-    final = run(storage_uri, true=close, constraints=["mean_steps >= 3"], mean_seeds=8)
+    final = run(storage_uri, true=close, constraints=["mean_steps >= 3"], mean_seeds=5)
     seeds = {number: standing.n_seeds for number, standing in final.race().standings.items()}
     assert seeds[CONTROL] == FINAL_EVAL["min_seeds"]
-    assert seeds[0] + seeds[1] == 16
+    assert seeds[0] + seeds[1] == 10
 
 
 def test_candidate_that_violates_a_constraint_in_the_race_is_not_chosen(storage_uri):
@@ -496,6 +496,21 @@ def test_one_seed_that_violates_a_constraint_does_not_decide(storage_uri):
         trial.set_user_attr(METRICS, {"mean_steps": value})
         trial.study.tell(trial, value)
     assert final.violated() == {}
+
+
+def test_configuration_that_violates_a_constraint_late_is_shown_over_all_its_seeds(storage_uri):
+    final, (selection, _) = opened(storage_uri, constraints=["mean_steps <= 2.9"])
+    steps = iter((1.0, 1.0, 1.0, 9.0, 9.0))
+    n_trained = 0
+    while (trial := selection.claim({})) is not None:
+        is_control = training_of(trial)[0] == CONTROL
+        value, n_trained = next(steps) if is_control else 2.0, n_trained + is_control
+        trial.set_user_attr(METRICS, {"mean_steps": value})
+        trial.study.tell(trial, value)
+    standing = final.race().standings[CONTROL]
+    assert standing.is_withdrawn
+    assert standing.n_seeds == n_trained == 4
+    assert standing.estimate.value == pytest.approx(-3.0)
 
 
 def test_configuration_that_is_changed_back_trains_what_the_other_dropped(storage_uri):
