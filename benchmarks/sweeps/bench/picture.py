@@ -55,7 +55,7 @@ def _draw_ranks(axes: Axes, ranks: pd.DataFrame) -> None:
     axes.set_xlim(left=0)
     axes.set_title("what a study chooses, by sampler and pruner")
     axes.grid(alpha=0.3)
-    axes.legend(ncols=3, fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.12))
+    axes.legend(ncols=3, fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.16))
 
 
 def _draw_races(axes: Axes, fixed: Sequence[Choices], races: Mapping[str, Choices], *, title: str) -> None:
@@ -75,7 +75,7 @@ def _draw_races(axes: Axes, fixed: Sequence[Choices], races: Mapping[str, Choice
     axes.set_title(title)
     axes.grid(alpha=0.3, which="both")
     # Below the axes, where the legend hides no race.
-    axes.legend(fontsize=7, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.12))
+    axes.legend(fontsize=7, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.16))
 
 
 def _draw_keys(axes: Axes, keys: Mapping[str, Key]) -> None:
