@@ -97,9 +97,9 @@ def race(scores: Scores, seeds: Sequence[int], *, min_seeds: int, mean_seeds: in
 
     All configurations are trained with the first `min_seeds` seeds. Each further round has one training for every three
     configurations that remain, at least two, where they most increase the probability of a correct selection. The
-    race is over when the configurations have `mean_seeds` seeds on average, when choosing the leader is expected to
-    lose little (see `is_decided`), or when one configuration remains. The one whose interval has the highest lower end
-    is chosen; the first of equal ones.
+    race is over when the configurations have `mean_seeds` seeds on average, when the expected loss from choosing the
+    leader is small (see `is_decided`), or when one configuration remains. The one whose interval has the highest lower
+    end is chosen; the first of equal ones.
 
     Args:
         scores: Score of each finished training by configuration and seed, the higher the better. NaN for a failed
@@ -196,7 +196,7 @@ def half_widths(variances: FloatArray, n_seeds: Any) -> FloatArray:
 
 
 def is_decided(means: FloatArray, variances: FloatArray, n_seeds: Counts) -> NDArray[np.bool_]:
-    """Return whether the leader has enough seeds, and choosing it is expected to lose little, shape (...).
+    """Return whether the leader has enough seeds, and the expected loss from choosing it is small, shape (...).
 
     The expected loss, or expected opportunity cost, is the mean of max(0, d), where d is another configuration's true
     score minus the leader's, assumed to be normally distributed. For each other configuration, it must be at most

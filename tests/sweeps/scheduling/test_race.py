@@ -161,7 +161,7 @@ def test_variances_are_shrunk_towards_their_mean_as_in_moderated_t_statistics():
     assert half_widths(variances, n_seeds) == pytest.approx(widths)
 
 
-def test_race_is_decided_where_choosing_the_leader_is_expected_to_lose_little():
+def test_race_is_decided_where_the_expected_loss_from_choosing_the_leader_is_small():
     n_seeds, variances = np.array([LEADER_SEEDS + 2, LEADER_SEEDS, 3]), np.array([1.0, 2.0, 0.5])
     rng = np.random.default_rng(0)
     for gaps in ((1.0, 0.8), (2.0, 1.5), (2.5, 0.5), (0.5, 2.5), (1.2, 1.2)):
