@@ -145,6 +145,11 @@ class EvaluationReport:
         return groups
 
 
+def assigned(changes: Mapping[str, Any]) -> list[str]:
+    """Return changed rules as they are shown, such as `max_steps=3`."""
+    return [f"{key}={value}" for key, value in changes.items()]
+
+
 def report_tables(report: EvaluationReport, width: int) -> list[Table | Text]:
     """Return the tables to print besides the results: each volume of each group, and further figures.
 

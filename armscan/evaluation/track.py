@@ -12,7 +12,7 @@ from typing import Any
 from armscan.config.defaults import to_plain
 from armscan.errors import InvalidValueError
 from armscan.evaluation.agent_source import EvaluatedAgent
-from armscan.evaluation.report import EvaluationReport
+from armscan.evaluation.report import EvaluationReport, assigned
 from armscan.evaluation.runner import PreparedAgent
 from armscan.evaluation.volumes import check_out, data_name, file_name
 from armscan.experiment.build import on_plane_of
@@ -58,7 +58,6 @@ def evaluate_and_track(
     upload_pending(client)
     limits = on_plane_of(source.config)
     of, data = source.run.run_id if source.run else source.name, data_name(prepared.data)
-    notes = [*changed_rules(changes), *prepared.notes]
     facts = {
         "of": of,
         "name": source.name,
@@ -66,12 +65,12 @@ def evaluate_and_track(
         "episodes_a_split": n_episodes,
         "seed": seed,
         "changes": dict(changes),
-        "notes": notes,
+        "notes": list(prepared.notes),
     }
     with TrackedRun.start(
         client,
         experiment_id,
-        name=", ".join([f"evaluation: {source.name} on {data}", *_assigned(changes)]),
+        name=", ".join([f"evaluation: {source.name} on {data}", *assigned(changes)]),
         config={**to_plain(source.config), "evaluation": {**facts, "on_plane": [list(each) for each in limits]}},
         tags={EVALUATED_TAG: of},
         folder=FOLDER,
@@ -93,6 +92,7 @@ def evaluate_and_track(
         text = json.dumps(report.to_dict(), indent=1, allow_nan=False)
         atomic_write(file, text, follow_link=True)
         shown = own.with_suffix(".html")
+        notes = [*changed_rules(changes), *prepared.notes]
         sections, described = [], [f"Note: {note}." for note in notes]
         for label, table in report.tables().items():
             of_label = [f"Note: {note}." for note in notes_on(prepared, report, label)]
@@ -113,11 +113,7 @@ def notes_on(prepared: PreparedAgent, report: EvaluationReport, label: str) -> l
 
 def changed_rules(changes: Mapping[str, Any]) -> list[str]:
     """Return the notes on rules that differ from the agent's configuration: one, or none if no rule was changed."""
-    return [f"changed for this evaluation: {', '.join(_assigned(changes))}"] if changes else []
-
-
-def _assigned(changes: Mapping[str, Any]) -> list[str]:
-    return [f"{key}={value}" for key, value in changes.items()]
+    return [f"changed for this evaluation: {', '.join(assigned(changes))}"] if changes else []
 
 
 def _store_of(source: EvaluatedAgent, store: Mapping[str, Any]) -> tuple[TrackingStore, str]:

@@ -12,7 +12,7 @@ from typing import Any, Self
 from armscan.config.command_hints import armscan_command
 from armscan.errors import TrackingError
 from armscan.evaluation import EvaluationReport
-from armscan.evaluation.report import TOTAL
+from armscan.evaluation.report import TOTAL, assigned
 from armscan.tracking import FoundRun
 from armscan.tracking.sanitize import name_of
 from armscan.tracking.tags import EVALUATED_TAG
@@ -80,8 +80,8 @@ def _reports(run: FoundRun, folder: Path) -> dict[str, EvaluationReport]:
         reports["at the end of the run"] = _read(run, run.run_id, EVALUATION_FILE, folder)
     if (latest := _latest(run)) is not None:
         report = _read(run, *latest, folder)
-        changes = "".join(f", {key}={value}" for key, value in report.facts["changes"].items())
-        reports[f"by evaluation {latest[0]}, on {report.facts['data']}{changes}"] = report
+        title = f"by evaluation {latest[0]}, on {report.facts['data']}"
+        reports[", ".join([title, *assigned(report.facts["changes"])])] = report
     return reports
 
 
