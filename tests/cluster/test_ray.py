@@ -50,6 +50,7 @@ def test_study_that_is_told_to_end_hands_its_trials_back(cluster, start):
     assert {run.info.status for run in study.runs()} <= {"FINISHED", "KILLED"}
 
 
+@pytest.mark.slow
 def test_study_outlives_a_killed_worker_and_a_machine_that_is_gone(cluster, start):
     words = ["study.workers=2", "study.n_trials=3", "study.final_eval.top_k=0", "training.env_steps=8000"]
     study = start(*TRAINING, "hydra/launcher=ray", *words, environment=cluster.environment)

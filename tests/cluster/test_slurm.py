@@ -32,6 +32,7 @@ def job_of(cluster, number):
     return job
 
 
+@pytest.mark.slow
 def test_study_outlives_a_killed_worker_and_a_killed_job_that_slurm_says_nothing_of(cluster, start):
     study = start(*WAITING, *SLURM, "study.n_trials=4", "study.final_eval.top_k=0", environment=cluster.environment)
     study.kill_worker(0)

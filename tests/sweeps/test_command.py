@@ -211,7 +211,7 @@ def test_study_survives_a_killed_worker_and_hands_its_trials_back_when_it_is_int
     assert "Traceback" not in printed
 
 
-@pytest.mark.full
+@pytest.mark.slow
 @pytest.mark.usefixtures("database")
 def test_run_of_a_study_is_running_while_one_of_two_commands_works_and_killed_once_it_is_stopped(tmp_path):
     words = [*TINY, "study.n_trials=2", "study.workers=1", "study.final_eval.top_k=0", "training.env_steps=200000"]
