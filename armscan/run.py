@@ -22,7 +22,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from armscan.config.compose import application
-from armscan.config.credentials import check_words
+from armscan.config.credentials import check_overrides
 from armscan.config.defaults import MULTIRUN, PLAN, RESUME
 from armscan.config.error_messages import TRACEBACKS, one_line_message, print_mistake
 from armscan.config.sources import SWEEP
@@ -77,9 +77,9 @@ def raise_or_exit(error: BaseException) -> NoReturn:
     raise SystemExit(2)
 
 
-def launch(words: Sequence[str]) -> None:
-    """Run the command through Hydra, with these words as its arguments."""
-    sys.argv[1:] = words
+def launch(arguments: Sequence[str]) -> None:
+    """Run the command through Hydra with these arguments."""
+    sys.argv[1:] = arguments
     try:
         application(run)()
     except Exception as error:
@@ -90,16 +90,16 @@ def launch(words: Sequence[str]) -> None:
         raise launcher_error(launcher, error) from error
 
 
-def repeat_grid(words: Sequence[str], run_id: str, *, trust: bool) -> None:
+def repeat_grid(overrides: Sequence[str], run_id: str, *, trust: bool) -> None:
     """Run the jobs of a grid that have not finished.
 
     Args:
-        words: Words that repeat it.
+        overrides: Overrides that repeat it.
         run_id: MLflow run ID of its parent run.
         trust: Whether its jobs may build any class.
     """
     Multirun.repeats, Multirun.is_trusted = run_id, trust
-    launch([MULTIRUN[0], *words])
+    launch([MULTIRUN[0], *overrides])
 
 
 def _end_interrupted() -> None:
@@ -122,12 +122,12 @@ def main() -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     silence_libraries()
     # Hydra reads its options only before the first override, but users type them anywhere.
-    sys.argv[1:] = sorted(sys.argv[1:], key=lambda word: word not in MULTIRUN)
+    sys.argv[1:] = sorted(sys.argv[1:], key=lambda each: each not in MULTIRUN)
     try:
-        check_words(sys.argv[1:])
+        check_overrides(sys.argv[1:])
         check_folder_stays(sys.argv[1:])
         check_choices(sys.argv[1:])
-        if any(word.startswith(f"{SWEEP}=") for word in sys.argv[1:]):
+        if any(each.startswith(f"{SWEEP}=") for each in sys.argv[1:]):
             if PLAN not in sys.argv[1:]:
                 print("preparing a study: its space is checked first", flush=True)
             # Deferred until after the first line; invalid overrides are reported before Optuna is loaded.
@@ -140,15 +140,15 @@ def main() -> int:
         if PLAN in sys.argv[1:]:
             print_grid_plan(sys.argv[1:])
             return 0
-        if any(word.startswith(f"{RESUME}=") for word in sys.argv[1:]):
+        if any(each.startswith(f"{RESUME}=") for each in sys.argv[1:]):
             # Before Hydra composes a configuration and creates a folder: a resumed run has both.
             from armscan.experiment.resume import resume
 
             resume(sys.argv[1:], repeat_grid)
         else:
-            words = with_folds(sys.argv[1:])
-            check_grid(words)
-            launch(words)
+            arguments = with_folds(sys.argv[1:])
+            check_grid(arguments)
+            launch(arguments)
     except BrokenPipeError:
         discard_output()
         return 1

@@ -162,7 +162,7 @@ def print_planes(options: LabellingOptions, labelled: Sequence[tuple[LabelVolume
     print("          volume's entry, or give the entry an exclude: REASON")
     if not options.markups:
         print("          (--markups writes the planes as files for 3D Slicer)")
-    words = ("data", "label", str(options.data), "--volume", "NAME", "--markup", f"FILE{MARKUP_SUFFIX}")
+    arguments = ("data", "label", str(options.data), "--volume", "NAME", "--markup", f"FILE{MARKUP_SUFFIX}")
     print("correct   move the plane in 3D Slicer, save it, and read it back:")
-    print(f"          {armscan_command(*words)}")
+    print(f"          {armscan_command(*arguments)}")
     print(f"check     {armscan_command('data', 'inspect', str(options.data))}")

@@ -120,7 +120,7 @@ def evaluate(
     # As in `armscan run`: the evaluation's run is closed as KILLED.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     changes = {name: value for name, value in rules.items() if value is not None}
-    _check_words(run, agent, data, changes)
+    _check_arguments(run, agent, data, changes)
     _check_options(agent, data, tracking_experiment, video=video)
     folder = None if data == "phantom" else data
     print(f"preparing {f'run {run[0]}' if agent is None else f'agent={agent}'}", flush=True)
@@ -193,18 +193,18 @@ def _check_options(agent: str | None, data: str | None, tracking_experiment: str
         raise InvalidValueError(f"--data is {data!r}, but {what}: it must be a folder of volumes, or phantom")
 
 
-def _check_words(run: Sequence[str], agent: str | None, data: str | None, changes: Mapping[str, Any]) -> None:
+def _check_arguments(run: Sequence[str], agent: str | None, data: str | None, changes: Mapping[str, Any]) -> None:
     """Raise an error unless there is one run or an agent, with no override that is an option here."""
     if agent is None:
-        if any("=" in word for word in run):
+        if any("=" in override for override in run):
             raise click.UsageError(f"{' '.join(run)!r} configures an agent: give --agent NAME with it, or RUN alone")
         if len(run) != 1:
             raise click.UsageError("give one RUN, or --agent NAME")
         return
     given = {CHANGES[name]: f"--{name.replace('_', '-')}" for name in changes}
     given |= dict.fromkeys(("data", "data.path"), "--data") if data is not None else {}
-    for word in run:
-        key = word.partition("=")[0].lstrip("+~")
+    for override in run:
+        key = override.partition("=")[0].lstrip("+~")
         if key != ON_PLANE_KEY and (key in OPTIONS or key.startswith(("tracking.", "evaluation."))):
             instead = f"give {OPTIONS[key]}" if key in OPTIONS else "see armscan evaluate --help"
             raise click.UsageError(f"{key} cannot be set here: {instead}")

@@ -23,7 +23,7 @@ UV_RUN = "UV_RUN_RECURSION_DEPTH"
 
 @cache
 def typed(program: str) -> tuple[str, ...]:
-    """Return the words that start a program of this Python's environment, from the folder of the command."""
+    """Return the arguments that start a program of this Python's environment, from the folder of the command."""
     if UV_RUN in os.environ:
         return "uv", "run", program
     file, found = Path(sys.executable).with_name(program), shutil.which(program)
@@ -32,14 +32,14 @@ def typed(program: str) -> tuple[str, ...]:
     return (str(file.relative_to(STARTED_IN) if file.is_relative_to(STARTED_IN) else file),)
 
 
-def kept_command(words: Iterable[str]) -> str:
+def kept_command(overrides: Iterable[str]) -> str:
     """Return the command that runs these Hydra overrides, in the machine-independent form that a run stores."""
-    return shlex.join([*RUN, *words])
+    return shlex.join([*RUN, *overrides])
 
 
-def run_command(words: Iterable[str]) -> str:
+def run_command(overrides: Iterable[str]) -> str:
     """Return the command that runs these Hydra overrides."""
-    return shlex.join([*typed(RUN[0]), *RUN[1:], *words])
+    return shlex.join([*typed(RUN[0]), *RUN[1:], *overrides])
 
 
 def resume_command(run_id: str, tracking_uri: str, *, trust: bool) -> str:
@@ -54,18 +54,20 @@ def resume_command(run_id: str, tracking_uri: str, *, trust: bool) -> str:
     return run_command([f"{RESUME}={run_id}", *where, *((TRUST,) if trust else ())])
 
 
-def armscan_command(*words: str, tracking: str | None = None, storage: str | None = None, trust: bool = False) -> str:
+def armscan_command(
+    *arguments: str, tracking: str | None = None, storage: str | None = None, trust: bool = False
+) -> str:
     """Return a command of the program `armscan`.
 
     Args:
-        words: The command and its arguments.
+        arguments: Name of the command, and its arguments.
         tracking: MLflow tracking URI, added unless it is the default one. Default: None, no URI.
         storage: Optuna storage, added unless it is the default one. Default: None, no storage.
         trust: Whether the command needs `--trust`. Default: False.
     """
     stores = ["--storage", storage] if storage is not None and storage != default_storage() else []
     stores += ["--tracking", tracking] if tracking is not None and not _is_default_store(tracking) else []
-    return shlex.join([*typed("armscan"), *words, *stores, *((TRUST,) if trust else ())])
+    return shlex.join([*typed("armscan"), *arguments, *stores, *((TRUST,) if trust else ())])
 
 
 def _is_default_store(uri: str) -> bool:

@@ -125,9 +125,9 @@ def config_loader() -> Iterator[ConfigLoader]:
         yield GlobalHydra.instance().config_loader()
 
 
-def compose_run(words: Sequence[str]) -> tuple[DictConfig, dict[str, str]]:
+def compose_run(overrides: Sequence[str]) -> tuple[DictConfig, dict[str, str]]:
     """Return the configuration of a run, without the section of a study, and the choice of each group."""
-    return reduce_to_run(compose(words, return_hydra_config=True))
+    return reduce_to_run(compose(overrides, return_hydra_config=True))
 
 
 def reduce_to_run(config: DictConfig) -> tuple[DictConfig, dict[str, str]]:

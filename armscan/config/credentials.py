@@ -54,10 +54,10 @@ def check_address(name: str, uri: str) -> None:
     raise InvalidValueError(f"{name} has a password in its address, where others could read it: {instead}")
 
 
-def check_words(words: Sequence[str]) -> None:
-    """Raise `InvalidValueError` if a `key=value` word of a command line contains a password."""
-    for word in words:
-        key, _, value = word.partition("=")
+def check_overrides(overrides: Sequence[str]) -> None:
+    """Raise `InvalidValueError` if an override `key=value` contains a password."""
+    for override in overrides:
+        key, _, value = override.partition("=")
         # Hydra removes the backslash of an escaped colon, and reads several values.
         check_address(key, value.replace("\\", ""))
 

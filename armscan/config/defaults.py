@@ -1,4 +1,4 @@
-"""Configuration outside Hydra: plain values, default stores, and keys and words that have a meaning of their own."""
+"""Configuration outside Hydra: plain values, default stores, and keys and values that have a meaning of their own."""
 
 from __future__ import annotations
 

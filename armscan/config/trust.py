@@ -69,7 +69,7 @@ def stored_config(config: Mapping[str, Any], *, where: str, trust: bool) -> dict
 
 
 def check_composed(config: Mapping[str, Any], *, where: str) -> None:
-    """Raise `UntrustedError` if a configuration, composed from stored words, names a class that no file here names.
+    """Raise `UntrustedError` if a configuration, composed from stored overrides, names a class that no file here names.
 
     The files are armscan's own, and those in `./conf` and `./sweeps` of the working folder.
 
@@ -103,16 +103,16 @@ def _foreign_part(config: Mapping[str, Any], allowed: Collection[str]) -> str | 
     return None
 
 
-def untrusted_word(words: Sequence[str], uri: str) -> str | None:
+def untrusted_override(overrides: Sequence[str], uri: str) -> str | None:
     """Return the first override of a command line that could execute code, or send results elsewhere; None if none.
 
     Args:
-        words: Overrides of the command line.
+        overrides: Overrides of a command line.
         uri: Address of the store that keeps them.
     """
-    for word in words:
+    for override in overrides:
         # Hydra removes the backslash of an escaped colon or brace.
-        plain = word.replace("\\", "")
+        plain = override.replace("\\", "")
         key, _, value = plain.lstrip("+~").partition("=")
         # Hydra also accepts a quoted value.
         value = value.strip("'\"")
@@ -122,22 +122,22 @@ def untrusted_word(words: Sequence[str], uri: str) -> str | None:
         # A key with dots is a value, which may be any path, and never a group.
         is_outside = "." not in key.partition("@")[0] and OUTSIDE.search(value) is not None
         if is_elsewhere or is_changing_hydra or is_outside or TARGET in plain or INTERPOLATION in plain:
-            return word
+            return override
     return None
 
 
-def check_stored_words(words: Sequence[str], uri: str, *, where: str) -> None:
+def check_stored_overrides(overrides: Sequence[str], uri: str, *, where: str) -> None:
     """Raise `UntrustedError` if a stored command line could execute code, or send results elsewhere.
 
     Args:
-        words: Overrides of the command line.
+        overrides: Overrides of a command line.
         uri: Address of the store that they were read from.
         where: Owner of the command line, such as `run 3bf2`, for the error.
     """
-    if (word := untrusted_word(words, uri)) is not None:
+    if (override := untrusted_override(overrides, uri)) is not None:
         raise UntrustedError(
-            f"{where}: its command line has {word!r}, which could execute code of others or send results elsewhere; "
-            f"{HOW}"
+            f"{where}: its command line has {override!r}, which could execute code of others or send results "
+            f"elsewhere; {HOW}"
         )
 
 

@@ -78,21 +78,21 @@ def _n_env_steps(facts: Mapping[str, Any], run_id: str) -> int:
     return n_env_steps
 
 
-def agent_of_overrides(words: Sequence[str], folder: str | None, changes: Mapping[str, Any]) -> EvaluatedAgent:
+def agent_of_overrides(overrides: Sequence[str], folder: str | None, changes: Mapping[str, Any]) -> EvaluatedAgent:
     """Return the agent of a configuration, composed as `armscan run` composes it.
 
     Args:
-        words: Overrides `key=value`, with `agent=NAME`, and with `data=nifti` if there is a folder.
+        overrides: Overrides `key=value`, with `agent=NAME`, and with `data=nifti` if there is a folder.
         folder: Folder of the volumes to evaluate on, which also count as its own. None: the volumes of the
             configuration.
         changes: Changed rules, by the names in `CHANGES`.
     """
-    config = compose(words)
+    config = compose(overrides)
     check_keys(config)
     if folder:
         config.data.path = folder
     OmegaConf.resolve(config)
-    agents = [word.partition("=")[2] for word in words if word.startswith("agent=")]
+    agents = [override.partition("=")[2] for override in overrides if override.startswith("agent=")]
     return EvaluatedAgent(agents[-1], changed(config, changes))
 
 

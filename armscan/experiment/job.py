@@ -57,7 +57,7 @@ class Job:
         parent_run_id: MLflow run ID of its parent run.
         folder: Folder of the grid.
         repeats: MLflow run ID of the grid that is repeated without its finished jobs. Default: None, a new grid.
-        is_trusted: Whether it may build any class; false if its words were stored and not trusted. Default: True.
+        is_trusted: Whether it may build any class; false if its overrides were stored and not trusted. Default: True.
         launcher: Process of the grid's launcher, with which the job ends. Default: None, it goes on without it, as on a
             cluster.
     """
@@ -81,10 +81,11 @@ class Job:
         parent = json.loads((folder / PARENT_FILE).read_text())
         overrides = list(hydra_config.overrides.task)
         varied = [override for override in overrides if override not in parent["common"]]
-        words = shlex.join(overrides), " ".join(varied)
         launcher = ProcessInfo.of(parent["launcher"]) if parent["launcher"] else None
         repeated = parent["repeats"], parent["is_trusted"]
-        return cls(hydra_config.job.num, *words, parent["run_id"], folder, *repeated, launcher)
+        return cls(
+            hydra_config.job.num, shlex.join(overrides), " ".join(varied), parent["run_id"], folder, *repeated, launcher
+        )
 
     @property
     def label(self) -> str:
@@ -137,25 +138,25 @@ class Invocation:
         )
 
 
-def check_folder_stays(words: Sequence[str]) -> None:
+def check_folder_stays(overrides: Sequence[str]) -> None:
     """Raise `InvalidValueError` if a command line asks Hydra to change to the folder of each run."""
-    for word in words:
-        key, _, value = word.lstrip("+").partition("=")
+    for override in overrides:
+        key, _, value = override.lstrip("+").partition("=")
         if key == "hydra.job.chdir" and value.lower() != "false":
             raise InvalidValueError(
                 f"{key} is {value!r}, but it must be false: relative paths, the store's too, begin where it was started"
             )
 
 
-def check_choices(words: Sequence[str]) -> None:
+def check_choices(overrides: Sequence[str]) -> None:
     """Raise `InvalidValueError` if a command line removes a configuration group or gives it a list, as Hydra allows."""
-    for word in words:
-        key, _, value = word.partition("=")
+    for override in overrides:
+        key, _, value = override.partition("=")
         group = key.lstrip("+~")
         is_list = "[" in value and not value.startswith("glob(")
         if group in CHOICES and (key.startswith("~") or is_list):
             raise InvalidValueError(
-                f"{word!r} is not allowed: a run has one {group}, {group}=NAME (armscan run --help lists the names)"
+                f"{override!r} is not allowed: a run has one {group}, {group}=NAME (armscan run --help lists the names)"
             )
 
 

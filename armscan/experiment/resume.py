@@ -18,7 +18,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from armscan.agents import Learner
 from armscan.config.defaults import RESUME, TRACKING_URI, default_tracking
-from armscan.config.trust import TRUST, check_stored_words, stored_config
+from armscan.config.trust import TRUST, check_stored_overrides, stored_config
 from armscan.errors import InvalidValueError, ResumeError, UntrustedError, printable
 from armscan.experiment.build import set_up
 from armscan.experiment.provenance import place_tags, volume_tags
@@ -42,20 +42,20 @@ if TYPE_CHECKING:
     from mlflow.entities import Run
 
 
-def resume(words: Sequence[str], repeat_grid: Callable[..., None]) -> None:
+def resume(arguments: Sequence[str], repeat_grid: Callable[..., None]) -> None:
     """Resume the run that a command line names.
 
     Args:
-        words: Overrides on the command line.
+        arguments: Arguments of the command line.
         repeat_grid: Function that runs the unfinished jobs of a grid; see `armscan.run.repeat_grid`.
 
     Raises:
-        InvalidValueError: If the words say anything else.
-        UntrustedError: If it would execute code of others, and the words have no `--trust`.
+        InvalidValueError: If they say anything else.
+        UntrustedError: If it would execute code of others, and there is no `--trust`.
         ArmscanError: If there is no such run, it is still running, or its checkpoint or volumes are not its own.
     """
-    trust = TRUST in words
-    wanted, uri = _read([word for word in words if word != TRUST])
+    trust = TRUST in arguments
+    wanted, uri = _read([each for each in arguments if each != TRUST])
     check_run_id(wanted)
     client = open_existing_store(uri)
     run = find_run(client, wanted)
@@ -71,12 +71,13 @@ def resume(words: Sequence[str], repeat_grid: Callable[..., None]) -> None:
     repeat_grid(grid, run.info.run_id, trust=trust)
 
 
-def _check_store(run: Run, words: Sequence[str], uri: str) -> None:
+def _check_store(run: Run, overrides: Sequence[str], uri: str) -> None:
     """Raise `ResumeError` if the jobs of a grid would be tracked in another store than the one that it was read from.
 
     To be called in the grid's working folder, where a relative address of its store begins.
     """
-    given = [each for each in OverridesParser.create().parse_overrides([*words]) if each.key_or_group == TRACKING_URI]
+    parsed = OverridesParser.create().parse_overrides([*overrides])
+    given = [each for each in parsed if each.key_or_group == TRACKING_URI]
     stored = str(given[-1].value()) if given else uri
     places = [
         str(Path(sqlite_file(each)).resolve()) if each.startswith(SQLITE_PREFIX) else each.rstrip("/")
@@ -90,11 +91,11 @@ def _check_store(run: Run, words: Sequence[str], uri: str) -> None:
 
 
 def _grid_of(run: Run) -> list[str]:
-    """Return the words that repeat a grid."""
+    """Return the overrides that repeat a grid."""
     try:
         return TypeAdapter(list[str]).validate_json(_tag(run, GRID_TAG), strict=True)
     except ValidationError as error:
-        raise ResumeError(f"run {run.info.run_id}: its tag {GRID_TAG} holds no words of a command line") from error
+        raise ResumeError(f"run {run.info.run_id}: its tag {GRID_TAG} holds no overrides") from error
 
 
 def _tag(run: Run, name: str) -> str:
@@ -105,10 +106,10 @@ def _tag(run: Run, name: str) -> str:
         raise ResumeError(f"run {run.info.run_id} has no tag {name}, which every run of armscan run has") from error
 
 
-def _check_grid(run: Run, words: Sequence[str], uri: str) -> None:
+def _check_grid(run: Run, overrides: Sequence[str], uri: str) -> None:
     """Raise `UntrustedError` if a grid's command line, or its working folder, is untrusted."""
     where = f"run {run.info.run_id}"
-    check_stored_words(words, uri, where=where)
+    check_stored_overrides(overrides, uri, where=where)
     # Its `conf/` and `sweeps/` are part of the configuration.
     folder = Path(_tag(run, "working_folder"))
     if folder.resolve() != Path.cwd().resolve():
@@ -145,14 +146,14 @@ def resume_run(
         return run_tracked(setup, tracked, folder, client.uri, job_label=job_label, earlier=earlier)
 
 
-def _read(words: Sequence[str]) -> tuple[str, str]:
+def _read(overrides: Sequence[str]) -> tuple[str, str]:
     """Return the wanted run and the store to look in."""
     values = {TRACKING_URI: default_tracking()["uri"]}
-    for word in words:
-        key, equals, text = word.partition("=")
+    for override in overrides:
+        key, equals, text = override.partition("=")
         if not equals or key not in (RESUME, TRACKING_URI):
             raise InvalidValueError(
-                f"{word!r} cannot be combined with {RESUME}=, because a run keeps its original configuration: "
+                f"{override!r} cannot be combined with {RESUME}=, because a run keeps its original configuration: "
                 f"only {TRACKING_URI}= and {TRUST} may be added"
             )
         if key in values and key == RESUME and values[key] != text:

@@ -132,8 +132,8 @@ def run_tracked(
     if job_label is None:
         files = (RESULTS_PAGE, *((LEARNING_CURVE_FILE,) if result else ()), VIDEO_FILE)
         print_where_to_look(folder, tracking_uri, files=files)
-        words = ("evaluate", tracked.run_id, "--data", "FOLDER")
-        print(f"evaluate  {armscan_command(*words, tracking=tracking_uri, trust=trust)}")
+        arguments = ("evaluate", tracked.run_id, "--data", "FOLDER")
+        print(f"evaluate  {armscan_command(*arguments, tracking=tracking_uri, trust=trust)}")
     return reached.metrics()
 
 

@@ -16,8 +16,8 @@ from armscan.errors import InvalidValueError
 MAY_SET_FOLDS = (f"{FOLDS}=", "experiment=")
 
 
-def with_folds(words: Sequence[str]) -> list[str]:
-    """Return the words of a command line, as a grid over the folds if they ask for folds.
+def with_folds(arguments: Sequence[str]) -> list[str]:
+    """Return the arguments of a command line, as a grid over the folds if they ask for folds.
 
     Other keys that the grid varies, such as `seed=0,1,2`, stay.
 
@@ -25,10 +25,10 @@ def with_folds(words: Sequence[str]) -> list[str]:
         InvalidValueError: If the folds are not allowed or vary, or `data.path` or `data.test` contradicts them.
         ArmscanError: If the folder of the volumes cannot be read.
     """
-    overrides = [word for word in words if not word.startswith("-")]
-    options = [word for word in words if word.startswith("-")]
-    if set(options) - set(MULTIRUN) or not any(word.lstrip("+").startswith(MAY_SET_FOLDS) for word in overrides):
-        return list(words)
+    overrides = [each for each in arguments if not each.startswith("-")]
+    options = [each for each in arguments if each.startswith("-")]
+    if set(options) - set(MULTIRUN) or not any(each.lstrip("+").startswith(MAY_SET_FOLDS) for each in overrides):
+        return list(arguments)
     try:
         parsed = OverridesParser.create().parse_overrides(overrides)
         # Overrides that the grid varies are left out: they do not set its folds.
@@ -37,13 +37,13 @@ def with_folds(words: Sequence[str]) -> list[str]:
         n_volumes = data.get("n_volumes")
     # Hydra or the run reports it.
     except (HydraException, OmegaConfBaseException):
-        return list(words)
+        return list(arguments)
     if fold is not None or any(each.key_or_group == FOLD for each in parsed):
-        return list(words)
+        return list(arguments)
     if any(each.key_or_group == FOLDS and each.is_sweep_override() for each in parsed):
         raise InvalidValueError(f"{FOLDS} has several values, but all jobs of a grid share one: start a grid for each")
     if folds is None:
-        return list(words)
+        return list(arguments)
     # Deferred: command-line errors are reported before these are loaded.
     from armscan.training.subject_splits import check_folds, n_folds
     from armscan.volumes.dataset import subjects_in

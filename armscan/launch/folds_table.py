@@ -28,11 +28,11 @@ def folds_table(runs: Iterable[tuple[Path, Sequence[str]]], n_folds: int | None 
     # By title, training and fold.
     tested: dict[str, dict[str, dict[str, Evaluation]]] = {}
     for folder, varied in runs:
-        words = dict(word.partition("=")[::2] for word in varied)
-        if (fold := words.pop(FOLD, None)) is None:
+        overrides = dict(override.partition("=")[::2] for override in varied)
+        if (fold := overrides.pop(FOLD, None)) is None:
             return None
-        training = words.pop("seed", "")
-        others = " ".join(f"{key}={value}" for key, value in words.items())
+        training = overrides.pop("seed", "")
+        others = " ".join(f"{key}={value}" for key, value in overrides.items())
         for name, evaluation in _evaluations(folder).items():
             title = ", ".join(filter(None, (name, others)))
             # A baseline plays the same episodes for every training seed: they count once.

@@ -16,21 +16,22 @@ from armscan.config.sources import SWEEP
 from armscan.errors import ArmscanError, InvalidValueError
 from armscan.launch.folds_grid import with_folds
 
-# With these words, only Hydra knows the jobs.
+# With these arguments, only Hydra knows the jobs.
 NOT_CHECKED = ("-", "hydra/sweeper", "hydra.sweeper")
 
 
-def print_grid_plan(words: Sequence[str]) -> None:
+def print_grid_plan(arguments: Sequence[str]) -> None:
     """Print the jobs that a command line would run, folds of a cross-validation included.
 
     Args:
-        words: Words of the command line.
+        arguments: Arguments of the command line.
 
     Raises:
         InvalidValueError: If they describe a single run.
         HydraException: If a job cannot be composed.
     """
-    overrides = [word for word in with_folds([word for word in words if word != PLAN]) if word not in MULTIRUN]
+    with_its_folds = with_folds([each for each in arguments if each != PLAN])
+    overrides = [each for each in with_its_folds if each not in MULTIRUN]
     parsed, jobs = jobs_of(overrides)
     if len(jobs) == 1:
         raise InvalidValueError(
@@ -42,17 +43,18 @@ def print_grid_plan(words: Sequence[str]) -> None:
     for number, job in enumerate(jobs):
         # Raises the error that the job would.
         compose(job)
-        print(f"{number:4d}  {' '.join(word for word in job if word not in fixed)}")
+        print(f"{number:4d}  {' '.join(each for each in job if each not in fixed)}")
 
 
-def check_grid(words: Sequence[str]) -> None:
+def check_grid(arguments: Sequence[str]) -> None:
     """Raise the error of the first job if all jobs of a grid have wrong overrides; otherwise the correct ones run.
 
     Args:
-        words: Words of the command line; a single run, and a sweeper other than Hydra's basic one, are left to Hydra.
+        arguments: Arguments of the command line; a single run, and a sweeper other than Hydra's basic one, are left to
+            Hydra.
     """
-    overrides = [word for word in words if word not in MULTIRUN]
-    if len(overrides) == len(words) or any(word.startswith(NOT_CHECKED) for word in overrides):
+    overrides = [each for each in arguments if each not in MULTIRUN]
+    if len(overrides) == len(arguments) or any(each.startswith(NOT_CHECKED) for each in overrides):
         return
     print("preparing a grid: checking its overrides", flush=True)
     # Deferred: it takes time, so the line above comes first.

@@ -109,12 +109,12 @@ def _pooled_folds(
     parent: Mapping[str, Any], outcomes: Mapping[str, JobOutcome], runs: Sequence[Run]
 ) -> tuple[ResultTable, list[str]] | None:
     """Return one table over all folds of a cross-validation, and notes on it; None of another grid."""
-    if not any(word.startswith(f"{FOLD}=") for word in parent["overrides"]):
+    if not any(override.startswith(f"{FOLD}=") for override in parent["overrides"]):
         return None
-    planned = [dict(word.partition("=")[::2] for word in job) for job in jobs_of(parent["overrides"])[1]]
+    planned = [dict(override.partition("=")[::2] for override in job) for job in jobs_of(parent["overrides"])[1]]
     finished = [run for run in runs if outcomes[run.data.tags[JOB_TAG]].failure is None]
     varied = {
-        number: [word for word in shlex.split(outcome.overrides) if word not in parent["common"]]
+        number: [override for override in shlex.split(outcome.overrides) if override not in parent["common"]]
         for number, outcome in outcomes.items()
     }
     tested = [(Path(run.data.tags[FOLDER_TAG]), varied[run.data.tags[JOB_TAG]]) for run in finished]

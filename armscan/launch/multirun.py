@@ -20,7 +20,7 @@ from armscan.config.credentials import check_address
 from armscan.config.defaults import TRACKING_URI, to_plain
 from armscan.config.error_messages import one_line_message
 from armscan.config.task import have_same_task
-from armscan.config.trust import needs_trust, untrusted_word
+from armscan.config.trust import needs_trust, untrusted_override
 from armscan.errors import InvalidValueError, TrackingError
 from armscan.experiment.job import (
     INTERRUPTED,
@@ -91,10 +91,10 @@ class Multirun(Callback):
         (folder / OUTCOME_FOLDER).mkdir(parents=True)
         command = " ".join(overrides)
         # Includes the tracking URI, because the environment may differ later.
-        hydra_words = [word for word in config.hydra.overrides.hydra if not word.startswith(NOT_REPEATED)]
+        hydra_overrides = [each for each in config.hydra.overrides.hydra if not each.startswith(NOT_REPEATED)]
         again = [
             *overrides,
-            *hydra_words,
+            *hydra_overrides,
             f"{TRACKING_URI}={QuotedString(tracking['uri'], Quote.single).with_quotes()}",
         ]
         tags = {
@@ -111,7 +111,7 @@ class Multirun(Callback):
         parent |= {"launcher": asdict(ProcessInfo.current()) if launcher in ON_THIS_MACHINE else None}
         # Also if it was resumed with --trust.
         is_told = Multirun.repeats is not None and Multirun.is_trusted
-        parent |= {"trust": is_told or untrusted_word(again, tracking["uri"]) is not None}
+        parent |= {"trust": is_told or untrusted_override(again, tracking["uri"]) is not None}
         (folder / PARENT_FILE).write_text(json.dumps(parent))
         Multirun.folder, Multirun.outbox = folder, begin_outbox(folder, run.info.run_id, tracking["uri"])
         Multirun.launcher = launcher

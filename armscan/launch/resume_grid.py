@@ -85,8 +85,8 @@ def earlier_runs(client: TrackingStore, experiment_id: str, sums: Mapping[str, s
     parents = {run.info.run_id: run.data.tags.get(PARENT_TAG) for run in found if STUDY_TAG not in run.data.tags}
     known = [each for each in {*parents.values(), job.parent_run_id} if each is not None and each.isalnum()]
     grids = client.runs([experiment_id], f"attributes.run_id IN ({', '.join(map(repr, known))})")
-    words = {grid.info.run_id: _words_of(grid) for grid in grids}
-    kin = {grid for grid in words if words[grid] == words.get(job.parent_run_id)} | {job.repeats, None}
+    overrides = {grid.info.run_id: _overrides_of(grid) for grid in grids}
+    kin = {grid for grid in overrides if overrides[grid] == overrides.get(job.parent_run_id)} | {job.repeats, None}
     own = [run for run in found if run.info.run_id in parents and parents[run.info.run_id] in kin]
     return sorted(own, key=lambda run: parents[run.info.run_id] != job.repeats)
 
@@ -117,8 +117,8 @@ def _joined(prints: Fingerprints) -> dict[str, str]:
     return {name: each for volumes in prints.values() for name, each in volumes.items()}
 
 
-def _words_of(grid: Run) -> set[str]:
-    """Return the words that repeat a grid, each once; empty for a run that is not a grid."""
+def _overrides_of(grid: Run) -> set[str]:
+    """Return the overrides that repeat a grid, each once; empty for a run that is not a grid."""
     with contextlib.suppress(ValueError, TypeError):
         return set(json.loads(grid.data.tags[GRID_TAG])) if GRID_TAG in grid.data.tags else set()
     return set()

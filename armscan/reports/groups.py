@@ -143,7 +143,7 @@ def _names(firsts: Sequence[TrackedTraining]) -> list[str]:
     chosen = [each for each in firsts[0].choices if len({training.choices.get(each) for training in firsts}) > 1]
     names = []
     for number, training in enumerate(firsts):
-        words = [f"{each}={training.choices.get(each, '?')}" for each in chosen]
+        parts = [f"{each}={training.choices.get(each, '?')}" for each in chosen]
         for key in keys:
             section = key.partition(".")[0]
             # The name of a choice implies its values, except for those that were overridden, or in which groups with
@@ -154,8 +154,8 @@ def _names(firsts: Sequence[TrackedTraining]) -> list[str]:
                 if section not in chosen or each.choices.get(section) == training.choices.get(section)
             ]
             if key in params[number] and (len(set(alike)) > 1 or key in training.overridden):
-                words.append(f"{key}={params[number][key]}")
-        names.append(", ".join(words) or SEED_IN_NAME.sub("", training.name))
+                parts.append(f"{key}={params[number][key]}")
+        names.append(", ".join(parts) or SEED_IN_NAME.sub("", training.name))
     return _distinct(names)
 
 

@@ -181,7 +181,7 @@ def _training(run: Run, histories: Mapping[str, History], files: Mapping[str, by
         series=series,
         evaluation=evaluation if evaluation and evaluation.episodes else None,
         baselines=baselines or {},
-        overridden=frozenset(word.lstrip("+").partition("=")[0] for word in tags.get(OVERRIDES_TAG, "").split()),
+        overridden=frozenset(each.lstrip("+").partition("=")[0] for each in tags.get(OVERRIDES_TAG, "").split()),
         commit=tags.get(COMMIT_TAG, tags.get(VERSION_TAG)),
         volumes=_parsed(run, files, VOLUMES_FILE, lambda contents: fingerprints_in(contents, VOLUMES_FILE)),
         video=files.get(VIDEO_FILE),

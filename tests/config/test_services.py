@@ -6,7 +6,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from armscan.config import credentials
-from armscan.config.credentials import check_address, check_words, mask_passwords, read_password
+from armscan.config.credentials import check_address, check_overrides, mask_passwords, read_password
 from armscan.config.defaults import default_storage, default_tracking
 from armscan.config.services import address_of, local_addresses, services_file
 from armscan.errors import InvalidValueError
@@ -76,18 +76,18 @@ def test_refused_address_says_where_to_put_the_password(name, uri, instead):
 
 
 def test_words_with_a_password_are_refused_and_others_are_not():
-    check_words(["a=b", "storage=postgresql://me@host/db", "x=http://host/a?b=c", "a:b@c"])
+    check_overrides(["a=b", "storage=postgresql://me@host/db", "x=http://host/a?b=c", "a:b@c"])
     with pytest.raises(InvalidValueError, match=r"^storage has a password in its address"):
-        check_words(["storage='postgresql://me:secret@host/db'"])
+        check_overrides(["storage='postgresql://me:secret@host/db'"])
     for value in (
         "sqlite:///mlruns.db,postgresql://me:secret@host/db",
         "{uri: 'http://me:secret@host'}",
         r"postgresql\://me\:secret@host/db",
     ):
         with pytest.raises(InvalidValueError, match=r"^tracking.uri has a password in its address"):
-            check_words([f"tracking.uri={value}"])
-    check_words(["tracking.uri=http://host:5000,http://me@host:5001/a@b"])
-    check_words(["tracking.uri=postgresql://h:5432/a,postgresql://me@h:5432/b"])
+            check_overrides([f"tracking.uri={value}"])
+    check_overrides(["tracking.uri=http://host:5000,http://me@host:5001/a@b"])
+    check_overrides(["tracking.uri=postgresql://h:5432/a,postgresql://me@h:5432/b"])
 
 
 def test_service_is_where_the_environment_says(monkeypatch):

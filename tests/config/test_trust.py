@@ -15,10 +15,10 @@ from armscan.config.trust import (
     check_artifact_address,
     check_composed,
     check_stored_address,
-    check_stored_words,
+    check_stored_overrides,
     offered_classes,
     stored_config,
-    untrusted_word,
+    untrusted_override,
 )
 from armscan.errors import UntrustedError
 
@@ -111,7 +111,7 @@ def test_offered_classes_are_of_runs_and_not_of_commands():
 )
 def test_stored_command_line_that_could_execute_code_is_refused(word):
     with pytest.raises(UntrustedError, match="run 1: its command line has"):
-        check_stored_words(["seed=1,2", word], STORE, where="run 1")
+        check_stored_overrides(["seed=1,2", word], STORE, where="run 1")
 
 
 def test_stored_command_line_of_a_usual_grid_is_accepted():
@@ -123,9 +123,9 @@ def test_stored_command_line_of_a_usual_grid_is_accepted():
         "data.path=/x,../y",
         "experiment=best_y,mine/best",
     ]
-    assert untrusted_word(words, STORE) is None
+    assert untrusted_override(words, STORE) is None
     for uri in ("sqlite:///mlruns.db", "'sqlite:///mlruns.db'", f"'{STORE}'"):
-        assert untrusted_word([f"tracking.uri={uri}"], STORE) is None
+        assert untrusted_override([f"tracking.uri={uri}"], STORE) is None
 
 
 def test_composed_configuration_builds_what_a_file_here_names_and_nothing_else(tmp_path, monkeypatch):

@@ -318,9 +318,9 @@ def test_resume_refuses_a_run_of_a_newer_version(answer, cut_off):
         ("working_folder", None, "has no tag working_folder"),
         ("working_folder", "/nowhere", "that folder cannot be entered (No such file or directory)"),
         ("working_folder", "a\0b", "that folder cannot be entered (embedded null byte)"),
-        (GRID_TAG, "x", "its tag grid holds no words of a command line"),
-        (GRID_TAG, "{}", "its tag grid holds no words of a command line"),
-        (GRID_TAG, "[1]", "its tag grid holds no words of a command line"),
+        (GRID_TAG, "x", "its tag grid holds no overrides"),
+        (GRID_TAG, "{}", "its tag grid holds no overrides"),
+        (GRID_TAG, "[1]", "its tag grid holds no overrides"),
     ],
 )
 def test_resume_refuses_a_run_whose_tags_are_not_those_of_armscan(answer, cut_off, tag, value, line):

@@ -306,7 +306,7 @@ def result_note(judgement: Judgement | None) -> str:
     """Return the result of a study in Markdown, as the study prints it; empty before a configuration was judged."""
     if judgement is None or judgement.of_chosen is None:
         return ""
-    settings = (f"{name}: {f'`{words}`' if words else NOTHING_SEARCHED}" for name, words in judgement.settings.items())
+    settings = (f"{name}: {f'`{each}`' if each else NOTHING_SEARCHED}" for name, each in judgement.settings.items())
     parts = [f"**{judgement.result}**", *settings, "The test volumes:", final_table(judgement.results).markdown()]
     if rows := [each.row() for each in judgement.differences]:
         parts += [f"{judgement.compared}:", markdown_table([*rows[0]], [[*row.values()] for row in rows]), HOW]

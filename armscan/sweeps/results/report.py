@@ -206,8 +206,8 @@ def _result(found: Sequence[ConfigResult], trials: Sequence[FrozenTrial]) -> str
     """Return the table of the result, and the settings of each trial in it."""
     of_each = {result.number: settings_of(trials, result.number) for result in found}
     rows = [{"configuration": name_of(number), **_settings(settings)} for number, settings in of_each.items()]
-    words = {number: html.escape(" ".join(overrides_of(settings))) for number, settings in of_each.items() if settings}
-    items = "".join(f"<li>{name_of(number)}: <code>{text}</code></li>" for number, text in words.items())
-    typed = folded("As words of the command line, with all digits", f"<ul>{items}</ul>") if items else ""
+    typed_of = {number: html.escape(" ".join(overrides_of(each))) for number, each in of_each.items() if each}
+    items = "".join(f"<li>{name_of(number)}: <code>{text}</code></li>" for number, text in typed_of.items())
+    typed = folded("As overrides, with all digits", f"<ul>{items}</ul>") if items else ""
     shown = f"<h3>Their settings</h3>{table(rows)}{typed}" if items else ""
     return f"{final_table(found).html()}{shown}"

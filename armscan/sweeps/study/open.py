@@ -128,11 +128,11 @@ def _tracked_run(
 
     Create the run if the study has none yet.
     """
-    name, words = study.study_name, " ".join(overrides)
+    name, typed = study.study_name, " ".join(overrides)
 
     @functools.cache
     def create_run() -> str:
-        tags = {**code_state().tags, STUDY_TAG: name, STORAGE_TAG: storage.uri, OVERRIDES_TAG: words}
+        tags = {**code_state().tags, STUDY_TAG: name, STORAGE_TAG: storage.uri, OVERRIDES_TAG: typed}
         return str(client.create_run(experiment_id, name=f"study {name}", tags=tags).info.run_id)
 
     def tracked_run() -> str:
@@ -147,8 +147,8 @@ def _tracked_run(
             tags={STUDY_TAG: name, TRIAL_TAG: None},
             where=f"{name}.user_attrs.{STUDY_RUN}",
         )
-        if is_command and run.data.tags.get(OVERRIDES_TAG) != words:
-            client.set_tag(run.info.run_id, OVERRIDES_TAG, words)
+        if is_command and run.data.tags.get(OVERRIDES_TAG) != typed:
+            client.set_tag(run.info.run_id, OVERRIDES_TAG, typed)
         return str(run.info.run_id)
 
     return storage.exclusive(tracked_run)
