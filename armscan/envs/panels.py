@@ -41,7 +41,7 @@ ColourImage = NDArray[np.uint8]
 Pixel = TypeVar("Pixel", bound=np.generic)
 Colour = tuple[int, int, int]
 Size = tuple[int, int]
-# Views from the palm, (along, across, 3), and the side, (along, depth, 3): drawn once per volume, and freed with it.
+# Views from high z, (along, across, 3), and the side, (along, depth, 3): drawn once per volume, and freed with it.
 _SIDES: WeakKeyDictionary[LabelVolume, tuple[ColourImage, ColourImage]] = WeakKeyDictionary()
 
 
@@ -52,7 +52,7 @@ def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 
 
 def slice_panel(view: View, max_size: Size) -> Image.Image:
-    """Draw a slice, palm up: each cluster outlined, numbered, and in a shade of its tissue's colour.
+    """Draw a slice, high z up: each cluster outlined, numbered, and in a shade of its tissue's colour.
 
     Pixels of a landmark that belong to no cluster are darker.
 
@@ -65,7 +65,7 @@ def slice_panel(view: View, max_size: Size) -> Image.Image:
     (n_across, n_depth), (across_mm, depth_mm) = view.geometry.shape, view.geometry.pixel_mm
     size_mm = n_across * across_mm, n_depth * depth_mm
     size = _size(size_mm, _scale(size_mm, max_size))
-    # Rows of the picture run from the palm, at high z, to the back of the hand.
+    # Rows of the picture run from high z, the palm in phantoms, to low z.
     colours = _resized(_slice_colours(view, numbers).transpose(1, 0, 2)[::-1], size)
     codes = np.where(numbers > 0, view.slice_xz * np.int32(numbers.max() + 1) + numbers, 0)
     colours[_outlines(_resized(codes.T[::-1], size))] = OUTLINE_COLOUR
@@ -109,7 +109,7 @@ def side_panels(
     planes: Sequence[tuple[ManipulatorAction, Colour, int]],
     max_sizes: tuple[Size, Size],
 ) -> tuple[Image.Image, Image.Image]:
-    """Draw the unmoved volume from the palm (frontal) and from the side (sagittal), fingers up, at one scale.
+    """Draw the unmoved volume from high z (frontal) and from the side (sagittal), fingers up, at one scale.
 
     In a right-handed frame, X then runs to the left, and the side is the one at high x.
 
@@ -123,8 +123,8 @@ def side_panels(
     is_flipped = is_right_handed(volume)
     if volume not in _SIDES:
         labels = volume.labels[::-1] if is_flipped else volume.labels
-        from_palm, from_side = _first_seen(labels[:, :, ::-1], 2), _first_seen(labels, 0)
-        _SIDES[volume] = TISSUE_COLOURS[from_palm.T], TISSUE_COLOURS[from_side]
+        from_high_z, from_side = _first_seen(labels[:, :, ::-1], 2), _first_seen(labels, 0)
+        _SIDES[volume] = TISSUE_COLOURS[from_high_z.T], TISSUE_COLOURS[from_side]
     across_mm, along_mm, depth_mm = volume.size_mm
     sizes_mm = (across_mm, along_mm), (depth_mm, along_mm)
     scale = min(_scale(size_mm, max_size) for size_mm, max_size in zip(sizes_mm, max_sizes, strict=True))

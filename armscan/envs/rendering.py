@@ -104,10 +104,11 @@ def draw_plane(
     # With fingers at low Y, as in phantoms. A plane turned by more than 90°, or mirrored, shows its other side.
     is_front = np.cross(axes[:, 0], axes[:, 2])[1] < 0.0
     seen_from = "fingers" if is_right_handed(volume) == is_front else "elbow"
+    up = "palm" if volume.has_palm_at_high_z else "back of the hand"
     frontal, sagittal = side_panels(volume, transform, planes, (_size_of(FRONTAL_BOX), _size_of(SAGITTAL_BOX)))
     for box, title, panel in (
-        (SLICE_BOX, f"slice, palm up, from the {seen_from}", slice_panel(view, _size_of(SLICE_BOX))),
-        (FRONTAL_BOX, "frontal, from the palm", frontal),
+        (SLICE_BOX, f"slice, {up} up, from the {seen_from}", slice_panel(view, _size_of(SLICE_BOX))),
+        (FRONTAL_BOX, f"frontal, from the {up}", frontal),
         (SAGITTAL_BOX, "sagittal", sagittal),
     ):
         _place(picture, draw, box, title, panel)

@@ -1,7 +1,8 @@
-"""Numbers, rates and tables as text."""
+"""Numbers, rates, tables and names as text."""
 
 from __future__ import annotations
 
+import unicodedata
 from collections.abc import Iterable, Sequence
 
 # Short form of a rate.
@@ -32,6 +33,13 @@ def is_zero(text: str) -> bool:
 def counted(number: int, what: str) -> str:
     """Return a number with its noun, such as `1 seed` or `3 seeds`."""
     return f"{number} {what}{'' if number == 1 else 's'}"
+
+
+def in_other_form(name: str, known: Iterable[str]) -> bool:
+    """Return whether a name is among others in another Unicode form, such as that of file names copied from a Mac."""
+    return any(
+        name != each and unicodedata.normalize("NFC", name) == unicodedata.normalize("NFC", each) for each in known
+    )
 
 
 def markdown_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -22,7 +22,7 @@ from armscan.volumes.manifest import (
 )
 from armscan.volumes.read_cache import read_cached, resample_cached
 from armscan.volumes.reading import ReadingOptions
-from armscan.volumes.resampling import finest_spacing
+from armscan.volumes.resampling import finest_spacing, is_same_spacing
 from armscan.volumes.volume import LabelVolume
 from armscan.volumes.volume_report import VolumeReport
 
@@ -165,9 +165,14 @@ def _manifest_of(path: str | Path, *, require_manifest: bool) -> tuple[Path | No
 
 def copies_among(volumes: Mapping[Key, LabelVolume]) -> Iterator[tuple[Key, Key]]:
     """Yield the keys of each pair of volumes with the same voxels; their labelled planes may differ."""
-    # Only volumes with the same spacing and the same sample of voxels are compared in full.
+    # Only volumes with the same sample of voxels are compared in full.
     seen: dict[Hashable, list[Key]] = {}
     for key, volume in volumes.items():
-        similar = seen.setdefault((volume.shape, volume.spacing, volume.labels_yxz[::16].tobytes()), [])
-        yield from ((other, key) for other in similar if np.array_equal(volumes[other].labels_yxz, volume.labels_yxz))
+        similar = seen.setdefault((volume.shape, volume.labels_yxz[::16].tobytes()), [])
+        yield from (
+            (other, key)
+            for other in similar
+            if is_same_spacing(volumes[other].spacing, volume.spacing)
+            and np.array_equal(volumes[other].labels_yxz, volume.labels_yxz)
+        )
         similar.append(key)

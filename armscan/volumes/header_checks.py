@@ -38,6 +38,8 @@ NRRD_TYPES |= {"long long int": 8, "ulonglong": 8, "int64": 8, "uint64": 8, "flo
 OTHER_LENGTHS = {f"{prefix}{unit}" for prefix in ("", "centi", "micro", "nano") for unit in ("meter", "metre")}
 OTHER_LENGTHS |= {f"{name}s" for name in OTHER_LENGTHS} | {"m", "cm", "um", "\u00b5m", "\u03bcm", "nm"}
 OTHER_LENGTHS |= {"micron", "microns", "in", "inch", "inches"}
+# ITK also writes what other formats said: `pixdim[1]` of NIfTI, `0008|0060` of DICOM.
+METAIMAGE_FIELD = re.compile(r"[A-Za-z0-9_]+(\[[0-9]+\])?|[0-9A-Fa-f]{4}\|[0-9A-Fa-f]{4}")
 # NRRD spaces that are not anatomical; SimpleITK reads them as left-posterior-superior.
 NO_ANATOMY = ("scanner-xyz", "sxyz", "3d-right-handed", "3dr", "3d-left-handed", "3dl")
 # Those that 3D Slicer writes, and slicerio reads.
@@ -100,7 +102,9 @@ def check_metaimage(path: Path) -> None:
     start, key, rest = text.partition(b"ElementDataFile")
     header = start + key + rest.partition(b"\n")[0] + b"\n"
     fields = _fields(path, header, "=")
-    if len(fields) < len(header.split(b"\n")) - 1 or not all(re.fullmatch("[A-Za-z0-9_]+", name) for name in fields):
+    if wrong := [name for name in fields if not METAIMAGE_FIELD.fullmatch(name)]:
+        raise VolumeError(f"{path}: the header is damaged: it has a field {wrong[0]!r}")
+    if len(fields) < len(header.split(b"\n")) - 1:
         raise VolumeError(f"{path}: the header is damaged: each line must be a field of its own, with a value")
     if missing := [name for name in METAIMAGE_FIELDS if name not in fields]:
         raise VolumeError(f"{path}: the header gives no {missing[0]}, but a MetaImage needs it")

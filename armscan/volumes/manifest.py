@@ -18,6 +18,7 @@ from yaml.representer import SafeRepresenter
 from armscan.errors import InvalidValueError, ManifestError, VolumeError, few, listed, reason_of
 from armscan.utils.files import atomic_write, cache_folder, sha256
 from armscan.utils.strict_yaml import check_no_duplicates, load_yaml
+from armscan.utils.text import in_other_form
 from armscan.utils.validation import check_float, check_path
 from armscan.volumes.header_checks import CHECKS
 from armscan.volumes.plane import ManipulatorAction
@@ -82,6 +83,11 @@ def volume_entries(manifest: Manifest, files: Mapping[str, Path], path: Path | N
 
     if manifest.volumes is None:
         return {name: VolumeEntry() for name in files}
+    if lookalikes := [name for name in manifest.volumes if name not in files and in_other_form(name, files)]:
+        raise ManifestError(
+            f"{path}: has an entry for {few(lookalikes)}, which the folder holds in another Unicode form, with accents "
+            "joined to their letters or apart: copy the name from the folder"
+        )
     if missing := [name for name in manifest.volumes if name not in files]:
         raise ManifestError(f"{path}: has an entry for {few(missing)}, but the folder holds no such volume")
     if unlisted := [name for name in files if name not in manifest.volumes]:
@@ -162,7 +168,10 @@ def _recorded(
         if path.suffix == ".json":
             text = json.dumps(entries if path.name == ENTRIES_ONLY else document, indent=1) + "\n"
         else:
-            text = _edited(path.read_text(encoding="utf-8-sig") if found else "", recorded, document)
+            before = path.read_bytes().decode("utf-8-sig") if found else ""
+            text = _edited(before.replace("\r\n", "\n"), recorded, document)
+            # The editor's lines end in \n.
+            text = text.replace("\n", "\r\n") if "\r\n" in before else text
         atomic_write(path, text, follow_link=True)
     # ruamel.yaml refuses some odd texts that PyYAML reads, with exceptions of many types.
     except Exception as error:

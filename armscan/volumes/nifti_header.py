@@ -10,6 +10,7 @@ import math
 import struct
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,29 +19,20 @@ from armscan.volumes.stored_voxels import GZIP, StoredVoxels, check_spacing, che
 
 # Voxel types by their code; the header's own `bitpix` may be anything, and is ignored when voxels are read.
 TYPES = {2: "u1", 4: "i2", 8: "i4", 16: "f4", 64: "f8", 256: "i1", 512: "u2", 768: "u4", 1024: "i8", 1280: "u8"}
-# By the header's size, NIfTI-1 or NIfTI-2: the `struct` format and the offset of each field, or of fields in a row.
-LAYOUTS = {
-    348: {
-        "magic": ("4s", 344),
-        "dim": ("8h", 40),
-        "datatype": ("h", 70),
-        "pixdim": ("8f", 76),
-        "vox_offset": ("f", 108),
-        "form_codes": ("2h", 252),
-        "forms": ("18f", 256),
-    },
-    540: {
-        "magic": ("8s", 4),
-        "dim": ("8q", 16),
-        "datatype": ("h", 12),
-        "pixdim": ("8d", 104),
-        "vox_offset": ("q", 168),
-        "form_codes": ("2i", 344),
-        "forms": ("18d", 352),
-    },
+# The `struct` format and the offset of each field, or of fields in a row.
+LAYOUT = {
+    "magic": ("4s", 344),
+    "dim": ("8h", 40),
+    "datatype": ("h", 70),
+    "pixdim": ("8f", 76),
+    "vox_offset": ("f", 108),
+    "form_codes": ("2h", 252),
+    "forms": ("18f", 256),
 }
-MAGIC = (b"n+1\0", b"n+2\0\r\n\032\n")
-LONGEST_HEADER = 544
+HEADER_BYTES, NIFTI_2_BYTES = 348, 540
+MAGIC = b"n+1\0"
+# After the header, four bytes say whether extensions follow.
+VOXELS_FROM = HEADER_BYTES + 4
 # No header is longer, extensions included.
 MAX_OFFSET = 1 << 24
 # Relative, between the spacings of pixdim and of the sform, both of which many programs round.
@@ -51,27 +43,14 @@ COSINE_TOLERANCE, ORIGIN_TOLERANCE = 0.01, 0.1
 
 def check_nifti(path: Path) -> None:
     """Raise `VolumeError` if a NIfTI file is damaged, contradicts itself, or has a form or voxel that is not finite."""
-    compression = GZIP if path.suffix == ".gz" else None
-    header = b""
-    with path.open("rb") as file:
-        for piece in pieces(path, file, compression):
-            header += piece[:LONGEST_HEADER]
-            if len(header) >= LONGEST_HEADER:
-                break
-    order, size = next(
-        ((order, size) for order in "<>" for size in LAYOUTS if header[:4] == struct.pack(f"{order}i", size)), ("<", 0)
-    )
-    if not 0 < size <= len(header) - 4:
-        raise VolumeError(f"{path}: the file does not begin with a NIfTI header")
-    fields = {name: struct.unpack_from(order + code, header, at) for name, (code, at) in LAYOUTS[size].items()}
+    order, fields = _header(path)
     (magic,), (n_dimensions, *sizes), (vox_offset,), (datatype,) = (
         fields[name] for name in ("magic", "dim", "vox_offset", "datatype")
     )
-    if magic not in MAGIC:
+    if magic != MAGIC:
         raise VolumeError(f"{path}: the header is damaged, or of a pair of files (.hdr and .img), which cannot be read")
-    # The four bytes after a header say whether extensions follow.
-    if not size + 4 <= vox_offset < MAX_OFFSET or vox_offset != int(vox_offset):
-        raise VolumeError(f"{path}: the header ends at byte {size + 4}, but its voxels begin at byte {vox_offset:g}")
+    if not VOXELS_FROM <= vox_offset < MAX_OFFSET or vox_offset != int(vox_offset):
+        raise VolumeError(f"{path}: the header ends at byte {VOXELS_FROM}, but its voxels begin at byte {vox_offset:g}")
     if not 1 <= n_dimensions <= 7 or datatype not in TYPES:
         raise VolumeError(
             f"{path}: has {n_dimensions} dimensions and voxels of type {datatype}, but a labelmap has 3, and integers "
@@ -92,11 +71,36 @@ def check_nifti(path: Path) -> None:
         StoredVoxels(
             path,
             int(vox_offset) + count_voxels(path, sizes[:n_dimensions]) * voxel.itemsize,
-            compression=compression,
+            compression=_compression(path),
             n_before=int(vox_offset),
             finite=voxel.str if voxel.kind == "f" else None,
         ),
     )
+
+
+def states_directions(path: Path) -> bool:
+    """Return whether a NIfTI file states the directions of its axes, in a qform or an sform."""
+    return any(code > 0 for code in _header(path)[1]["form_codes"])
+
+
+def _header(path: Path) -> tuple[str, dict[str, tuple[Any, ...]]]:
+    """Return the byte order of a header, for `struct`, and its fields."""
+    header = b""
+    with path.open("rb") as file:
+        for piece in pieces(path, file, _compression(path)):
+            header += piece[:VOXELS_FROM]
+            if len(header) >= VOXELS_FROM:
+                break
+    if header[:4] in (struct.pack(f"{order}i", NIFTI_2_BYTES) for order in "<>"):
+        raise VolumeError(f"{path}: the file is NIfTI-2, but NIfTI-1 is read: save it as NIfTI-1, as with nibabel")
+    order = ">" if header[:4] == struct.pack(">i", HEADER_BYTES) else "<"
+    if header[:4] != struct.pack(f"{order}i", HEADER_BYTES) or len(header) < VOXELS_FROM:
+        raise VolumeError(f"{path}: the file does not begin with a NIfTI header")
+    return order, {name: struct.unpack_from(order + code, header, at) for name, (code, at) in LAYOUT.items()}
+
+
+def _compression(path: Path) -> int | None:
+    return GZIP if path.suffix == ".gz" else None
 
 
 def _check_spacings_agree(path: Path, spacing: Sequence[float], sform: Sequence[float]) -> None:
@@ -126,9 +130,16 @@ def _check_forms_agree(path: Path, pixdim: Sequence[float], forms: Sequence[floa
     sform = np.reshape(forms[6:], (3, 4))
     cosines = sform[:, :3] / np.linalg.norm(sform[:, :3], axis=0)
     moved = np.linalg.norm(sform[:, 3] - offset) / min(pixdim[1:])
-    if np.abs(cosines - turned).max() > COSINE_TOLERANCE or moved > ORIGIN_TOLERANCE:
+    if np.abs(cosines - turned).max() > COSINE_TOLERANCE:
+        angle_deg = math.degrees(math.acos(min(1.0, (np.sum(cosines * turned, axis=0)).min())))
+        difference = f"directions, by up to {angle_deg:.3g}°; a cosine may differ by {COSINE_TOLERANCE}"
+    elif moved > ORIGIN_TOLERANCE:
         origins = (", ".join(f"{number:g}" for number in each) for each in (offset, sform[:, 3]))
-        raise VolumeError(
-            f"{path}: qform and sform state different places in the world (origins ({') and ('.join(origins)})): copy "
-            "the right one over the other, as with fslorient"
+        difference = (
+            f"origins, ({') and ('.join(origins)}); they may differ by {ORIGIN_TOLERANCE} of the smallest spacing"
         )
+    else:
+        return
+    raise VolumeError(
+        f"{path}: qform and sform state different {difference}: copy the right one over the other, as with fslorient"
+    )

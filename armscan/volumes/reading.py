@@ -15,6 +15,7 @@ from armscan.utils.arrays import FloatArray
 from armscan.utils.validation import check_choice, check_path
 from armscan.volumes.header_checks import CHECKS
 from armscan.volumes.labelmap import FoundSource, LabelMap, check_landmarks, map_values
+from armscan.volumes.nifti_header import states_directions
 from armscan.volumes.orientation import AXES, Crop, check_axes, check_crop, check_orientation, orientation_of
 from armscan.volumes.plane import ManipulatorAction
 from armscan.volumes.segmentation import OVERLAPS, SEGMENTATION_SUFFIX, read_segmentation
@@ -119,8 +120,13 @@ def read_stored(
         found=found,
         missing=missing_sources(options.labels, found),
         crop_mm=options.crop_mm,
+        has_directions=_states_directions(path),
     )
     return volume, stored
+
+
+def _states_directions(path: Path) -> bool:
+    return states_directions(path) if path.name.endswith((".nii", ".nii.gz")) else True
 
 
 def _read_labels(path: Path, options: ReadingOptions) -> tuple[SimpleITK.Image, tuple[FoundSource, ...]]:
@@ -197,6 +203,11 @@ def _in_order(
     import SimpleITK
 
     if options.orientation is not None:
+        if not _states_directions(path):
+            raise VolumeError(
+                f"{path}: orientation is {options.orientation!r}, but the file states no directions to orient it by "
+                "(no qform and no sform): store them, as with fslorient, or give the volume's entry orientation: null"
+            )
         image = SimpleITK.DICOMOrient(image, options.orientation)
     order = [options.axes.index(axis) for axis in AXES]
     labels = SimpleITK.GetArrayFromImage(image).transpose(2, 1, 0).transpose(order)

@@ -20,6 +20,11 @@ def finest_spacing(volumes: Iterable[LabelVolume]) -> Spacing:
     return s_x, s_y, s_z
 
 
+def is_same_spacing(one: Spacing, other: Spacing) -> bool:
+    """Return whether two spacings are the same, as files store them: to about six digits."""
+    return np.allclose(one, other, rtol=1e-5, atol=0.0)
+
+
 def resample(volume: LabelVolume, spacing: Spacing) -> LabelVolume:
     """Resample a volume by nearest neighbour.
 
@@ -35,8 +40,7 @@ def resample(volume: LabelVolume, spacing: Spacing) -> LabelVolume:
     Raises:
         VolumeError: If the volume would have more than 2^30 voxels.
     """
-    # Files store spacings to about six digits.
-    if np.allclose(volume.spacing, spacing, rtol=1e-5, atol=0.0):
+    if is_same_spacing(volume.spacing, spacing):
         return volume
     # Deferred: slow to import, and few folders need it.
     import SimpleITK

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,8 @@ from armscan.utils.arrays import FloatArray
 from armscan.volumes.labelmap import BACKGROUND, TISSUE_LABELS, FoundSource, LabelMap, apply_table, count_values, shown
 
 SEGMENTATION_SUFFIX = ".seg.nrrd"
+# As slicerio finds them.
+SEGMENT_FIELD = re.compile("Segment([0-9]+)_(.+)")
 OVERLAPS = ("refuse", "first", "last")
 
 
@@ -84,14 +87,34 @@ def _contents(path: Path) -> dict[str, Any]:
         ) from error
     if not contents["segments"]:
         raise VolumeError(f"{path}: the file names no segment (Segment0_Name, ...), but a segmentation needs some")
+    for segment, name in zip(contents["segments"], _names(path), strict=True):
+        segment["name"] = segment["id"] if name is None else name
     return contents
+
+
+def _names(path: Path) -> list[str | None]:
+    """Return the names of the segments in slicerio's order, None without a name; slicerio keeps ASCII alone."""
+    import nrrd
+
+    with path.open(encoding="utf-8", errors="surrogateescape") as file:
+        fields = [(SEGMENT_FIELD.fullmatch(key), value) for key, value in nrrd.read_header(file).items()]
+    names = dict[int, str | None]()
+    for found, value in fields:
+        if found is not None:
+            names.setdefault(int(found[1]), None)
+            if found[2] == "Name":
+                names[int(found[1])] = value
+    for name in names.values():
+        if name is not None and not name.isprintable():
+            raise VolumeError(f"{path}: has the segment {name!a}, but a name must be printable text in UTF-8")
+    return [names[number] for number in sorted(names)]
 
 
 def _segments(stored: list[dict[str, Any]], n_layers: int, labels: LabelMap | None, path: Path) -> list[Segment]:
     """Return the segments in the order of the file; each must be mapped, and have its own value in its layer."""
     segments, unnamed, places = [], [], set()
     for position, each in enumerate(stored):
-        name = str(each.get("name", each["id"]))
+        name = str(each["name"])
         # Before Slicer 4.11 each segment had a layer of its own, with the value 1.
         layer, value = each.get("layer", position), each.get("labelValue", 1)
         if not 0 <= layer < n_layers or value == 0 or (layer, value) in places:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from armscan.errors import InvalidValueError, VolumeError, listed, printable
 from armscan.utils.arrays import FloatArray
 from armscan.utils.validation import check_int, check_numbers
-from armscan.volumes.labelmap import ALLOWED_LABELS, LABEL_NAMES, LANDMARK_LABELS, check_whole, shown
+from armscan.volumes.labelmap import ALLOWED_LABELS, LABEL_NAMES, LANDMARK_LABELS, TISSUE_LABELS, check_whole, shown
 from armscan.volumes.plane import ManipulatorAction
 from armscan.volumes.rigid_transform import RigidTransform
 from armscan.volumes.slicing import clearance, occupied_depths, sample_plane
@@ -135,6 +135,14 @@ class LabelVolume:
         digest = hashlib.sha256(repr(rest).encode())
         digest.update(np.ascontiguousarray(self.labels).data)
         return digest.hexdigest()
+
+    @cached_property
+    def has_palm_at_high_z(self) -> bool:
+        """Whether the tendons lie at higher z than the bones on average, as in phantoms; true if either is missing."""
+        depths = range(self.shape[2])
+        of_tissues = ((self.labels == TISSUE_LABELS[each]).sum(axis=(0, 1)) for each in ("bones", "tendons"))
+        bones, tendons = (np.average(depths, weights=each) if each.any() else None for each in of_tissues)
+        return bones is None or tendons is None or bool(tendons > bones)
 
     @cached_property
     def centre_mm(self) -> tuple[float, float, float]:

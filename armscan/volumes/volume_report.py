@@ -6,12 +6,9 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
-
 from armscan.volumes.labelmap import (
     BACKGROUND,
     LABEL_NAMES,
-    TISSUE_LABELS,
     FoundSource,
     LabelMap,
     Source,
@@ -35,6 +32,7 @@ class StoredFile:
         found: Every value or segment, its label and the number of its voxels in the file.
         missing: Values and segments of the label map that the file does not contain.
         crop_mm: Part of the volume that is kept, in mm; None for all.
+        has_directions: Whether the file states the directions of its axes; otherwise 'LPS' is assumed.
     """
 
     shape: tuple[int, ...]
@@ -43,6 +41,7 @@ class StoredFile:
     found: tuple[FoundSource, ...]
     missing: tuple[Source, ...]
     crop_mm: Crop | None
+    has_directions: bool
 
 
 @dataclass(frozen=True)
@@ -73,7 +72,9 @@ class VolumeReport:
         if size_mm[1] < max(size_mm):
             sizes = " x ".join(f"{mm:.0f}" for mm in size_mm)
             notes.append(f"y, along the arm, is not the longest of {sizes} mm; axes in the manifest orders them")
-        if not self._has_palm_at_high_z():
+        if not self.stored.has_directions:
+            notes.append("the file states no directions of its axes (no qform and no sform); LPS is assumed")
+        if not self.volume.has_palm_at_high_z:
             notes.append("the palm is at low z, in phantoms at high z; orientation in the manifest flips axes")
         return notes
 
@@ -81,15 +82,6 @@ class VolumeReport:
     def has_size_of_an_arm(self) -> bool:
         """Whether an arm can be as long as the longest side."""
         return SMALLEST_MM <= max(self.volume.size_mm) <= LARGEST_MM
-
-    def _has_palm_at_high_z(self) -> bool:
-        """Return whether the tendons lie at higher z than the bones on average."""
-        depths = range(self.volume.shape[2])
-        bones, tendons = (
-            np.average(depths, weights=(self.volume.labels == TISSUE_LABELS[tissue]).sum(axis=(0, 1)))
-            for tissue in ("bones", "tendons")
-        )
-        return bool(tendons > bones)
 
     @property
     def tissue_mm3(self) -> dict[str, float]:

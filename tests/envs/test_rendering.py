@@ -170,6 +170,17 @@ def test_title_says_from_where_the_slice_is_seen(phantom, monkeypatch, is_right_
     assert f"slice, palm up, from the {seen_from if is_right_handed else other[seen_from]}" in written
 
 
+def test_titles_say_where_the_palm_is_not_at_high_z(phantom, monkeypatch):
+    from PIL import ImageDraw
+
+    written = []
+    monkeypatch.setattr(ImageDraw.ImageDraw, "text", lambda _, __, text, **___: written.append(text))
+    plane = ManipulatorAction((10.0, 0.0), (30.0, 40.0))
+    volume = LabelVolume(np.ascontiguousarray(phantom.labels[:, :, ::-1]), phantom.spacing, "turned over")
+    draw_plane(volume, plane, view_of(volume, plane))
+    assert {"slice, back of the hand up, from the fingers", "frontal, from the back of the hand"} <= set(written)
+
+
 def test_draw_plane_shortens_a_long_name(phantom, monkeypatch):
     from PIL import ImageDraw
 

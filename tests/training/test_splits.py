@@ -190,6 +190,9 @@ def test_split_refuses_a_copy_that_has_another_plane(tiny_volume):
     copy = replace(tiny_volume, optimal_action=ManipulatorAction((1.0, 0.0), (0.0, 3.0)))
     with pytest.raises(InvalidValueError, match=r"c \(test\) is a copy of a \(training\)"):
         Split({"a": tiny_volume}, {"b": other}, {"c": copy})
+    # Formats store different numbers of digits.
+    with pytest.raises(InvalidValueError, match=r"c \(test\) is a copy of a \(training\)"):
+        Split({"a": tiny_volume}, {"b": other}, {"c": replace(copy, spacing=np.float32(copy.spacing).tolist())})
     # The same voxels of another size are another wrist's.
     Split({"a": tiny_volume}, {"b": other}, {"c": replace(copy, spacing=(0.5, 0.5, 0.5))})
 

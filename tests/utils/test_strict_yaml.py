@@ -49,6 +49,20 @@ def test_long_numbers_are_refused_before_they_are_computed(text):
         load_yaml(f"a: {text}")
 
 
+@pytest.mark.parametrize("text", ["010", "008", "-007", "1:30", "1_0", "1_0.5", "0_1"])
+def test_numbers_that_yaml_reads_as_others_are_refused_unless_they_are_quoted(text):
+    with pytest.raises(ValueError, match=rf'it holds {text}, which YAML would read as .* quotes \("{text}"\)'):
+        load_yaml(f"a: [{text}]")
+    assert load_yaml(f"a: ['{text}']") == {"a": [text]}
+
+
+@pytest.mark.parametrize(
+    "text", ["0", "-0.5", "00.5", "10", "0x1F", "1.0e-05", "00001_labels.nii.gz", "2024-01-02", "a_1"]
+)
+def test_other_numbers_and_names_are_read(text):
+    assert load_yaml(f"a: {text}") == yaml.safe_load(f"a: {text}")
+
+
 def test_long_text_is_read():
     words, digits = "9 words, " * 200 + "end", "1" * 6000
     assert load_yaml(yaml.safe_dump([words, digits])) == [words, digits]

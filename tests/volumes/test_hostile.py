@@ -103,6 +103,13 @@ def test_an_image_of_more_voxels_than_any_scanner_produces_is_refused(refusal, n
     assert f"the image has {TOO_LARGE**3} voxels, but a labelmap has at most {2**30}" in refusal(name, contents[name])
 
 
+def test_metaimage_may_have_the_fields_that_itk_writes_of_other_formats(tmp_path):
+    fields = b"dim[0] = 3\npixdim[1] = 0.27\n0008|0060 = MR\nDimSize"
+    voxels = np.arange(1000, dtype=np.uint8) % 4
+    (tmp_path / "a.mha").write_bytes(mha(10, voxels.tobytes()).replace(b"DimSize", fields))
+    np.testing.assert_array_equal(read_volume(tmp_path / "a.mha").labels.transpose(2, 1, 0).ravel(), voxels)
+
+
 def test_an_image_of_several_values_in_a_voxel_is_refused(refusal):
     several = mha(10, bytes(3000)).replace(b"DimSize", b"ElementNumberOfChannels = 3\nDimSize")
     assert "ElementNumberOfChannels is 3, but a labelmap has one value per voxel" in refusal("a.mha", several)
@@ -140,8 +147,9 @@ VOXELS = np.ascontiguousarray(make_tiny_volume().labels[:10, :10, :10].T).tobyte
         (nifti(10, magic=bytes(4)), "of a pair of files (.hdr and .img), which cannot be read"),
         (nifti(10, place=float("nan")), "its qform or sform holds a NaN"),
         (nifti(10, place=float("inf")), "its qform or sform holds a NaN"),
-        (nifti(10, qform=(0, 0, 0.1, 0, 0, 0)), "qform and sform state different places in the world"),
-        (nifti(10, qform=(0, 0, 0, 0.2, 0, 0)), "(origins (0.2, 0, 0) and (0, 0, 0)): copy"),
+        (nifti(10, qform=(0, 0, 0.1, 0, 0, 0)), "qform and sform state different directions, by up to 11.5°"),
+        (nifti(10, qform=(0, 0, 0, 0.2, 0, 0)), "origins, (0.2, 0, 0) and (0, 0, 0); they may differ by 0.1 of"),
+        (struct.pack("<i", 540) + nifti(10)[4:], "the file is NIfTI-2, but NIfTI-1 is read"),
         (nifti(10, place=1.01), "the spacing is (1, 1, 1) by pixdim, but (1.01, 1, 1) by the sform"),
         (nifti(10, place=-0.99), "the spacing is (1, 1, 1) by pixdim, but (0.99, 1, 1) by the sform"),
     ],

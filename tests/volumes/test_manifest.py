@@ -58,6 +58,14 @@ def test_manifest_refuses_subjects_that_look_alike(folder, subjects, message):
         open_dataset(written(folder, {"volumes": entries}))
 
 
+def test_manifest_says_if_a_file_name_has_another_unicode_form(folder):
+    (folder / "b.nrrd").rename(folder / "Mu\u0308ller.nrrd")
+    with pytest.raises(
+        ManifestError, match=r"entry for M\u00fcller\.nrrd, which the folder holds in another Unicode form"
+    ):
+        open_dataset(written(folder, {"volumes": {"a.nii.gz": {}, "M\u00fcller.nrrd": {}}}))
+
+
 def test_volumes_that_would_be_left_out_silently_are_refused(folder):
     (folder / "c.nii.gz").symlink_to("annex/c")
     with pytest.raises(VolumeError, match=r"c\.nii\.gz: is a link to 'annex/c', but that file does not exist"):
@@ -227,6 +235,14 @@ def test_record_planes_keeps_comments_and_small_numbers(folder):
     text = record_planes(folder, {"a.nii.gz": (action, -1e-05)}).read_text()
     assert text.startswith("# ours\nvolumes:\n  a.nii.gz:\n    subject: 'S1'  # left\n    score: -1.0e-05\n")
     assert open_dataset(folder).volumes["a.nii.gz"].optimal_action == action
+
+
+def test_record_planes_keeps_the_ends_of_lines(folder):
+    (folder / "manifest.yaml").write_bytes(b"# ours\r\nvolumes:\r\n  a.nii.gz: {}\r\n  b.nrrd: {}\r\n")
+    contents = record_planes(folder, {"a.nii.gz": (ACTION, -0.01)}).read_bytes()
+    assert contents.startswith(b"# ours\r\nvolumes:\r\n")
+    assert contents.count(b"\n") == contents.count(b"\r\n")
+    assert open_dataset(folder).volumes["a.nii.gz"].optimal_action == ACTION
 
 
 @pytest.mark.parametrize("contents", [None, "axes: xyz", ""])

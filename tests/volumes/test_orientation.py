@@ -89,6 +89,19 @@ def test_orientation_of_oblique_axes_names_each_world_axis_once(seed):
     assert check_orientation(orientation) == orientation
 
 
+def test_nifti_without_directions_is_read_as_lps_and_not_oriented(tmp_path):
+    path = written(tmp_path, np.eye(3), [0.0, 0.0, 0.0], "a.nii")
+    contents = bytearray(path.read_bytes())
+    # The codes of qform and sform.
+    contents[252:256] = bytes(4)
+    path.write_bytes(contents)
+    np.testing.assert_array_equal(read_volume(path).labels, labels_of(block()))
+    notes = open_dataset(tmp_path, require_manifest=False).reports["a.nii"].notes
+    assert "the file states no directions of its axes (no qform and no sform); LPS is assumed" in notes
+    with pytest.raises(VolumeError, match="orientation is 'RAS', but the file states no directions"):
+        read_volume(path, orientation="RAS")
+
+
 def test_read_volume_names_the_axes_after_turning_them(tmp_path):
     path = written(tmp_path, np.eye(3), (0.0, 0.0, 0.0))
     # The file's axes run left, posterior, superior; turned, its first runs towards inferior, its third to the right.

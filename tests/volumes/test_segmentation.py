@@ -67,6 +67,21 @@ def test_segments_called_like_the_tissues_need_no_map(stored, tiny_volume):
     assert volume.spacing == pytest.approx((0.5, 0.7, 0.9))
 
 
+def test_names_of_segments_may_have_letters_beyond_ascii(tmp_path, tiny_volume):
+    labels = LabelMap(bones=["Trap\u00e8ze"], tendons=["\u817f"], artery=["Arterie"])
+    path = write_segmentation(
+        tmp_path / "a.seg.nrrd", tiny_volume.labels, [("Trap_e", 0, 1), ("tendon", 0, 2), ("Arterie", 0, 3)]
+    )
+    stored = path.read_bytes()
+    path.write_bytes(stored.replace(b"Trap_e", "Trap\u00e8ze".encode()).replace(b":=tendon", b":=" + "\u817f".encode()))
+    np.testing.assert_array_equal(read_volume(path, labels=labels).labels, tiny_volume.labels)
+    path.write_bytes(stored.replace(b"Trap_e", "Trap\u00e8ze".encode("latin-1")))
+    with pytest.raises(
+        VolumeError, match=r"has the segment 'Trap\\udce8ze', but a name must be printable text in UTF-8"
+    ):
+        read_volume(path, labels=labels)
+
+
 def test_segmentation_lies_where_simpleitk_puts_it(stored):
     import SimpleITK
 
