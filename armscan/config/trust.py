@@ -27,6 +27,7 @@ SERVER = re.compile(r"(?<![\w+.-])(?!sqlite:)[\w+.-]+://")
 OUTSIDE = re.compile(r"\.\.|(?<![\w-])/")
 # Schemes of artifacts whose clients send no password to a server of anybody's: object stores, a path, a folder.
 OBJECT_STORES = ("s3", "gs", "wasbs")
+AMBIGUOUS = frozenset("\\ ")
 WITHOUT_PASSWORD = (*OBJECT_STORES, "", "file")
 # Of grids and studies; the configuration of a run names none of their classes.
 GROUPS_OF_COMMANDS = ("hydra", "study")
@@ -61,11 +62,26 @@ def stored_config(config: Mapping[str, Any], *, where: str, trust: bool) -> dict
     config = migrate(config)
     if trust:
         return config
-    if found := _foreign_part(config, offered_classes()):
+    if found := _foreign_part(config, offered_classes()) or _misplaced_part(config):
         raise UntrustedError(f"{where}: its configuration {found}; {HOW}")
     data = config.get("data")
     # Phantoms would be written into any folder; the user's own cache holds the same ones.
     return config | {"data": {**data, "cache_dir": None}} if isinstance(data, dict) and "cache_dir" in data else config
+
+
+def _misplaced_part(config: Mapping[str, Any]) -> str | None:
+    """Return the part of a configuration that could write phantoms into any folder; None if there is none.
+
+    Only `data` makes volumes, and by named arguments.
+    """
+    for key, value in _leaves(config):
+        *_, name = parts = key.split(".")
+        if "_args_" in parts:
+            return f"has {key}, but armscan's classes are given arguments by name"
+        is_of_data = name == "cache_dir" or (name == TARGET and str(value).endswith("_data"))
+        if is_of_data and parts != ["data", name]:
+            return f"has {key}={value!r}, but only data makes volumes"
+    return None
 
 
 def check_composed(config: Mapping[str, Any], *, where: str) -> None:
@@ -170,7 +186,8 @@ def check_artifact_address(uri: str, store: str) -> None:
     scheme, host = _server_of(uri)
     of_store, own = _server_of(store)
     # Without a server of its own, `mlflow-artifacts:/...` is on the store's.
-    is_here = of_store in ("http", "https") and scheme in ("mlflow-artifacts", of_store) and host in ("", own)
+    is_named = host == own if scheme == of_store else scheme == "mlflow-artifacts" and host in ("", own)
+    is_here = of_store in ("http", "https") and is_named
     if scheme not in WITHOUT_PASSWORD and not is_here:
         raise UntrustedError(
             f"the artifacts are in {uri}, but those of the store {store} must be in a folder, in an object store "
@@ -180,6 +197,9 @@ def check_artifact_address(uri: str, store: str) -> None:
 
 def _server_of(uri: str) -> tuple[str, str]:
     """Return the scheme of an address, and its server: host and port, without a user; `unknown` if it has no form."""
+    # Clients disagree on the server of `http://one\\@other`.
+    if not AMBIGUOUS.isdisjoint(uri) or not uri.isprintable():
+        return "unknown", "unknown"
     try:
         parts = urlsplit(uri)
         port = parts.port

@@ -139,7 +139,8 @@ def facts_of(config: Mapping[str, Any], env: Env, run_id: str, slice_px: tuple[i
         "run": run_id,
         **{name: rules[name] for name in OF_OBSERVATION if name in rules},
         "observation": with_crops(rules["observation"], slice_px, slice_px),
-        "action": {name: means[name] for name in env.get_wrapper_attr("action_names")},
+        # A list, in the order of the action: MLflow sorts the keys of a mapping.
+        "action": [{"component": name, "value": means[name]} for name in env.get_wrapper_attr("action_names")],
     }
 
 

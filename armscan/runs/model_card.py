@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import shorten
@@ -78,15 +78,21 @@ def _reports(run: FoundRun, folder: Path) -> dict[str, EvaluationReport]:
     reports = {}
     if EVALUATION_FILE in run.files:
         reports["at the end of the run"] = _read(run, run.run_id, EVALUATION_FILE, folder)
-    if (latest := _latest(run)) is not None:
-        report = _read(run, *latest, folder)
-        title = f"by evaluation {latest[0]}, on {report.facts['data']}"
-        reports[", ".join([title, *assigned(report.facts["changes"])])] = report
+    is_own = bool(reports)
+    for position, (run_id, file) in enumerate(_evaluated(run)):
+        report = _read(run, run_id, file, folder)
+        changes = report.facts["changes"]
+        # The latest one and, if the run has no evaluation of its own, the latest by its rules.
+        if position == 0 or not changes:
+            title = f"by evaluation {run_id}, on {report.facts['data']}"
+            reports[", ".join([title, *assigned(changes)])] = report
+        if is_own or not changes:
+            break
     return reports
 
 
-def _latest(run: FoundRun) -> tuple[str, str] | None:
-    """Return the latest evaluation of a run that kept its JSON: the MLflow run ID of the evaluation, and the file."""
+def _evaluated(run: FoundRun) -> Iterator[tuple[str, str]]:
+    """Yield the evaluations of a run that kept their JSON, the latest first: MLflow run ID, and file."""
     found = run.client.search_runs(
         [run.experiment_id],
         f"tags.`{EVALUATED_TAG}` = '{run.run_id}' and attributes.status = 'FINISHED'",
@@ -95,8 +101,8 @@ def _latest(run: FoundRun) -> tuple[str, str] | None:
     for evaluation in found:
         for artifact in run.client.list_artifacts(evaluation.info.run_id):
             if artifact.path.endswith(".json") and not artifact.is_dir:
-                return evaluation.info.run_id, artifact.path
-    return None
+                yield evaluation.info.run_id, artifact.path
+                break
 
 
 def _read(run: FoundRun, run_id: str, file: str, folder: Path) -> EvaluationReport:

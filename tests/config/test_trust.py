@@ -20,7 +20,7 @@ from armscan.config.trust import (
     stored_config,
     untrusted_override,
 )
-from armscan.errors import UntrustedError
+from armscan.errors import UntrustedError, printable
 
 STORE = "http://127.0.0.1:5000"
 FOREIGN = (
@@ -56,6 +56,25 @@ def test_class_of_others_is_refused_at_every_place(data, target):
     with pytest.raises(UntrustedError, match="repeat the command with --trust"):
         stored_config(config, where="run 1", trust=False)
     assert stored_config(config, where="run 1", trust=True) == config
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"data.n_test": {"_target_": "armscan.training.phantom_data", "cache_dir": "/tmp"}},
+        {"agent.lr": {"_target_": "armscan.training.phantom_data", "n_training": 1}},
+        {"env.observation.0.cache_dir": "/tmp"},
+        {"data._args_": [1, 1, 1, 0, "/tmp"]},
+        {"env._args_": []},
+    ],
+)
+def test_stored_configuration_writes_phantoms_into_no_folder(changes):
+    config = OmegaConf.create(default_config())
+    for key, value in changes.items():
+        OmegaConf.update(config, key, value, force_add=True)
+    with pytest.raises(UntrustedError, match=r"run 1: its configuration has .*_args_|only data makes volumes"):
+        stored_config(to_plain(config), where="run 1", trust=False)
+    assert stored_config(default_config(), where="run 1", trust=False)["data"]["cache_dir"] is None
 
 
 def test_interpolation_is_refused(monkeypatch):
@@ -150,10 +169,21 @@ def test_password_is_sent_to_no_server_that_a_folder_names(uri):
 @pytest.mark.parametrize("store", [STORE, "sqlite:////mlruns.db"])
 @pytest.mark.parametrize(
     "uri",
-    ["http://elsewhere:5000/a", "mlflow-artifacts://elsewhere/a", "runs:/0/a", "abfss://a@elsewhere/a", "http://[a"],
+    [
+        *(
+            "http://elsewhere:5000/a",
+            "mlflow-artifacts://elsewhere/a",
+            "runs:/0/a",
+            "abfss://a@elsewhere/a",
+            "http://[a",
+        ),
+        # requests sends these to `elsewhere`, or nowhere; urllib names 127.0.0.1.
+        *(r"http://elsewhere:9\@127.0.0.1:5000/a", r"mlflow-artifacts://elsewhere\@127.0.0.1:5000/a"),
+        *("http://else where@127.0.0.1:5000/a", "http://127.0.0.1:5000\t@elsewhere/a", "http:elsewhere/a", "http:///a"),
+    ],
 )
 def test_password_is_sent_to_no_server_that_a_run_names_for_its_artifacts(uri, store):
-    with pytest.raises(UntrustedError, match=re.escape(f"the artifacts are in {uri}, but ")):
+    with pytest.raises(UntrustedError, match=re.escape(f"the artifacts are in {printable(uri)}, but ")):
         check_artifact_address(uri, store)
     for own in ("/a", "file:///a", "s3://bucket/a"):
         check_artifact_address(own, store)

@@ -16,8 +16,9 @@ import yaml
 from mlflow.exceptions import MlflowException
 
 from armscan.agents.policy import batch_of
+from armscan.envs import ArmscanEnv
 from armscan.errors import ExportError
-from armscan.policies.build import make_model, onnx_answers, save_policy
+from armscan.policies.build import facts_of, make_model, onnx_answers, save_policy
 from armscan.policies.model import FILES, arrays_of, is_model, model_sha256, others_in
 from armscan.tracking import TrackedRun, open_store
 from armscan.training.episode_seeds import EXPORT_SEED
@@ -253,7 +254,20 @@ def test_run_keeps_its_policy_or_says_why_not_and_finishes(regression, tmp_path,
         said = yaml.safe_load((folder / "policy" / "MLmodel").read_text())["metadata"]
         assert said["run"] == tracked.run_id
         assert said["observation"][1]["crop"] == [90, 80]
-        assert said["action"] == {"rz": "a times 90.0 degrees", "ty": "(a + 1) / 2 times 300.0, in mm"}
+        assert said["action"] == [
+            {"component": "rz", "value": "a times 90.0 degrees"},
+            {"component": "ty", "value": "(a + 1) / 2 times 300.0, in mm"},
+        ]
+
+
+def test_metadata_has_the_components_in_the_order_of_the_action(phantom, tmp_path):
+    env = ArmscanEnv([phantom], projection="full", ends="on_stop")
+    rules = {"observation": [], "rotation_bounds_deg": [90.0, 45.0], "translation_bounds_mm": None}
+    facts = facts_of({"env": rules}, env, "0", (90, 80))
+    learner, learners_env = learner_of(*VARIANTS[0], phantom)
+    make_model(learner, learners_env, tmp_path / "model", facts)
+    kept = yaml.safe_load((tmp_path / "model" / "MLmodel").read_text())["metadata"]["action"]
+    assert [each["component"] for each in kept] == [*env.action_names] == ["rz", "rx", "tx", "ty", "stop"]
 
 
 def test_run_keeps_no_policy_where_its_configuration_says_so(regression, tmp_path):

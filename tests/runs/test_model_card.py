@@ -137,6 +137,19 @@ def test_tags_of_a_run_without_an_evaluation_of_its_own_are_those_of_the_latest_
     assert card_of(run_id, tmp_path).tags["test_volumes/mean_steps"] == "6"
 
 
+def test_later_evaluation_by_changed_rules_takes_no_figures_from_the_card(keep, tmp_path):
+    run_id = keep("notes.txt", "")
+    earlier, unchanged, changed = (
+        keep("figures.json", json.dumps(BY_COMMAND | {"changes": changes, "data": data}), run_id)
+        for data, changes in (("a", {}), ("b", {}), ("c", {"max_steps": 3}))
+    )
+    card = card_of(run_id, tmp_path)
+    assert card.tags["test_volumes/mean_steps"] == "6"
+    assert f"### by evaluation {unchanged}, on b\n" in card.text
+    assert f"### by evaluation {changed}, on c, max_steps=3\n" in card.text
+    assert earlier not in card.text
+
+
 def test_card_of_a_policy_that_acts_otherwise_than_its_agent_says_so(keep, tmp_path):
     run_id = keep("evaluation.json", json.dumps(OWN))
     assert "not been evaluated" not in card_of(run_id, tmp_path).text
