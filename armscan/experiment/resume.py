@@ -24,6 +24,7 @@ from armscan.experiment.build import set_up
 from armscan.experiment.provenance import place_tags, volume_tags
 from armscan.experiment.runner import run_tracked
 from armscan.tracking import TrackedRun, TrackingStore, check_run_id, check_version, find_run, open_existing_store, sync
+from armscan.tracking.notes import Note
 from armscan.tracking.tags import FOLDER_TAG, GRID_TAG, STUDY_TAG
 from armscan.training import Fingerprints, check_unchanged, fingerprints_in, resume_from_checkpoint
 from armscan.utils.files import SQLITE_PREFIX, remove_unfinished, sha256, sqlite_file
@@ -63,6 +64,7 @@ def resume(arguments: Sequence[str], repeat_grid: Callable[..., None]) -> None:
         resume_run(client, run.info.run_id, trust=trust)
         return
     _check_unfinished(run)
+    _check_ended(run)
     grid = _grid_of(run)
     if not trust:
         _check_grid(run, grid, uri)
@@ -189,6 +191,15 @@ def _folder_of(run: Run) -> Path:
 def _check_unfinished(run: Run) -> None:
     if run.info.status == "FINISHED":
         raise ResumeError(f"run {run.info.run_id} has finished: there is nothing to resume")
+
+
+def _check_ended(run: Run) -> None:
+    """Raise `ResumeError` if a grid's launcher is alive on this machine: its jobs would be taken from it."""
+    launcher = note.process if (note := Note.of(run.info.run_id)) is not None else None
+    if run.info.status == "RUNNING" and launcher is not None and launcher.is_here and launcher.is_alive:
+        raise ResumeError(
+            f"run {run.info.run_id} is still running, in process {launcher.pid}: wait until it ends, or interrupt it"
+        )
 
 
 def _config_of(run: Run, folder: Path) -> dict[str, Any]:

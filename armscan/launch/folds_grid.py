@@ -5,15 +5,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
+from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from armscan.config.compose import compose
 from armscan.config.defaults import FOLD, FOLDS, MULTIRUN
-from armscan.errors import InvalidValueError
+from armscan.errors import InvalidValueError, listed
+from armscan.launch.grid_jobs import jobs_of
 
 # What may set `data.folds`.
 MAY_SET_FOLDS = (f"{FOLDS}=", "experiment=")
+# Choices of whole sections, which decide what the data is.
+GROUPS = ("experiment", "data")
 
 
 def with_folds(arguments: Sequence[str]) -> list[str]:
@@ -31,25 +36,41 @@ def with_folds(arguments: Sequence[str]) -> list[str]:
         return list(arguments)
     try:
         parsed = OverridesParser.create().parse_overrides(overrides)
-        # Overrides that the grid varies are left out: they do not set its folds.
-        data = compose([each.input_line for each in parsed if each.input_line and not each.is_sweep_override()]).data
-        folds, fold, path = data.get("folds"), data.get("fold"), data.get("path")
-        n_volumes = data.get("n_volumes")
+        data_of_jobs = _data_of_jobs(parsed)
     # Hydra or the run reports it.
     except (HydraException, OmegaConfBaseException):
         return list(arguments)
-    if fold is not None or any(each.key_or_group == FOLD for each in parsed):
+    if any(each.get("fold") is not None for each in data_of_jobs) or any(each.key_or_group == FOLD for each in parsed):
         return list(arguments)
     if any(each.key_or_group == FOLDS and each.is_sweep_override() for each in parsed):
         raise InvalidValueError(f"{FOLDS} has several values, but all jobs of a grid share one: start a grid for each")
-    if folds is None:
+    wanted = {tuple(each.get(key) for key in ("folds", "path", "n_volumes")) for each in data_of_jobs}
+    if all(folds is None for folds, *_ in wanted):
         return list(arguments)
+    if len(wanted) > 1:
+        of_jobs = listed(sorted({str(folds) for folds, *_ in wanted}))
+        raise InvalidValueError(
+            f"the jobs of this grid differ in {FOLDS} ({of_jobs}) or in their volumes, but all jobs of a grid share their "
+            "folds: start a grid for each"
+        )
+    ((folds, path, n_volumes),) = wanted
     # Deferred: command-line errors are reported before these are loaded.
     from armscan.training.subject_splits import check_folds, n_folds
     from armscan.volumes.dataset import subjects_in
 
     if path is None:
         raise InvalidValueError("data.path is not set, but it must be: give data.path=VALUE")
-    check_folds(folds, data.get("test"))
+    for each in data_of_jobs:
+        check_folds(folds, each.get("test"))
     count = n_folds(folds, len(set(subjects_in(path, n_volumes))))
     return [MULTIRUN[0], *overrides, f"{FOLD}={','.join(map(str, range(count)))}"]
+
+
+def _data_of_jobs(parsed: Sequence[Override]) -> list[DictConfig]:
+    """Return the sections `data` of a grid's jobs, each once; only choices of groups may vary them."""
+    setting = [
+        each for each in parsed if each.input_line and (each.key_or_group in GROUPS or not each.is_sweep_override())
+    ]
+    lines = [str(each.input_line) for each in setting]
+    jobs = jobs_of(lines)[1] if any(each.is_sweep_override() for each in setting) else [lines]
+    return [compose(job).data for job in jobs]

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
-from armscan.config.compose import compose, config_loader
+from armscan.config.compose import compose
 from armscan.config.defaults import MULTIRUN, PLAN
+from armscan.config.error_messages import one_line_message
 from armscan.config.sources import SWEEP
 from armscan.errors import ArmscanError, InvalidValueError
-from armscan.launch.folds_grid import with_folds
+from armscan.launch.folds_grid import GROUPS, with_folds
+from armscan.launch.grid_jobs import jobs_of
 
 # With these arguments, only Hydra knows the jobs.
 NOT_CHECKED = ("-", "hydra/sweeper", "hydra.sweeper")
@@ -38,7 +38,7 @@ def print_grid_plan(arguments: Sequence[str]) -> None:
             f"{PLAN} is given, but this is a single run: it shows the jobs of a grid, and what a study searches "
             f"({SWEEP}=NAME)"
         )
-    fixed = {each.input_line for each in parsed if not each.is_sweep_override()}
+    fixed = _check_fixed(parsed)
     print(f"a grid of {len(jobs)} jobs")
     for number, job in enumerate(jobs):
         # Raises the error that the job would.
@@ -61,7 +61,8 @@ def check_grid(arguments: Sequence[str]) -> None:
     from armscan.experiment.build import check_config, check_effects
 
     errors = []
-    _, jobs = jobs_of(overrides)
+    parsed, jobs = jobs_of(overrides)
+    _check_fixed(parsed)
     for job in jobs:
         config = compose(job)
         try:
@@ -74,10 +75,17 @@ def check_grid(arguments: Sequence[str]) -> None:
     raise errors[0]
 
 
-def jobs_of(overrides: Sequence[str]) -> tuple[list[Override], list[list[str]]]:
-    """Return the overrides of a grid, parsed, and those of each job."""
-    # Of `glob(...)`, the loader tells which choices there are.
-    with config_loader() as loader:
-        parsed = OverridesParser.create(config_loader=loader).parse_overrides(list(overrides))
-        (jobs,) = BasicSweeper.split_arguments(parsed, max_batch_size=None)
-    return parsed, jobs
+def _check_fixed(parsed: Sequence[Override]) -> list[str]:
+    """Return the overrides that all jobs share; raise an error if these alone, which Hydra composes, are wrong."""
+    fixed = [str(each.input_line) for each in parsed if not each.is_sweep_override()]
+    try:
+        compose(fixed)
+    except (HydraException, OmegaConfBaseException) as error:
+        varied = [each.key_or_group for each in parsed if each.is_sweep_override() and each.key_or_group in GROUPS]
+        if not varied:
+            raise
+        raise InvalidValueError(
+            f"{one_line_message(error)}; Hydra first composes a grid without {varied[0]}, which has several values: "
+            "choose the data of the others, too, for instance by data=mixed"
+        ) from error
+    return fixed

@@ -19,7 +19,7 @@ from armscan.experiment.console import print_result_table
 from armscan.experiment.job import JobOutcome
 from armscan.experiment.results import few_subjects
 from armscan.launch.folds_table import AGENT, ALL_FOLDS, folds_table
-from armscan.launch.grid_plan import jobs_of
+from armscan.launch.grid_jobs import jobs_of
 from armscan.reports.html import page
 from armscan.tracking.outbox import now_ms
 from armscan.tracking.tags import FOLDER_TAG, JOB_TAG
@@ -49,14 +49,22 @@ def keep_tables(
     from mlflow.exceptions import MlflowException
 
     try:
-        if (pooled := _pooled_folds(parent, outcomes, runs)) is not None:
+        planned = jobs_of(parent["overrides"])[1] if parent["has_known_jobs"] else None
+        n_finished = sum(outcome.failure is None for outcome in outcomes.values())
+        n_jobs = len(outcomes) if planned is None else len(planned)
+        if planned is not None and (pooled := _pooled_folds(parent, outcomes, runs, planned)) is not None:
             of_folds, notes = pooled
             print_result_table(f"{next(iter(of_folds.results)).split(', ')[1]} (test)", of_folds, notes)
             keep_folds_table(of_folds, table, folder, store, parent["run_id"], notes)
         else:
-            n_jobs = counted(sum(map(bool, table.facts["outcome"])), "job")
+            notes = (
+                [] if n_finished == n_jobs else [f"{n_jobs - n_finished} of {counted(n_jobs, 'job')} have no result"]
+            )
+            for note in notes:
+                print(f"note: {note}")
             body = f"<p><code>{html.escape(' '.join(parent['overrides']))}</code></p>{table.html()}"
-            _keep_page(folder, page(f"Grid of {n_jobs}", body), table.markdown(), store, parent["run_id"])
+            text = page(f"Grid of {counted(n_jobs, 'job')}", body, notes=notes)
+            _keep_page(folder, text, "\n\n".join([*notes, table.markdown()]), store, parent["run_id"])
     except (TrackingError, MlflowException, OSError) as error:
         print(f"the tables of the grid are not kept: {one_line_message(error) or error}", file=sys.stderr)
 
@@ -106,12 +114,15 @@ def _keep_page(folder: Path, text: str, description: str, store: TrackingStore, 
 
 
 def _pooled_folds(
-    parent: Mapping[str, Any], outcomes: Mapping[str, JobOutcome], runs: Sequence[Run]
+    parent: Mapping[str, Any],
+    outcomes: Mapping[str, JobOutcome],
+    runs: Sequence[Run],
+    jobs: Sequence[Sequence[str]],
 ) -> tuple[ResultTable, list[str]] | None:
     """Return one table over all folds of a cross-validation, and notes on it; None of another grid."""
     if not any(override.startswith(f"{FOLD}=") for override in parent["overrides"]):
         return None
-    planned = [dict(override.partition("=")[::2] for override in job) for job in jobs_of(parent["overrides"])[1]]
+    planned = [dict(override.partition("=")[::2] for override in job) for job in jobs]
     finished = [run for run in runs if outcomes[run.data.tags[JOB_TAG]].failure is None]
     varied = {
         number: [override for override in shlex.split(outcome.overrides) if override not in parent["common"]]

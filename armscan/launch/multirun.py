@@ -108,6 +108,8 @@ class Multirun(Callback):
             client.set_tag(Multirun.repeats, CONTINUED_TAG, run.info.run_id)
         parent = {"run_id": run.info.run_id, "tracking": tracking, "overrides": overrides, "common": _common(overrides)}
         parent |= {"repeats": Multirun.repeats, "is_trusted": Multirun.is_trusted}
+        # Only of Hydra's own sweeper, the jobs are known.
+        parent |= {"has_known_jobs": config.hydra.runtime.choices["hydra/sweeper"] == "basic"}
         parent |= {"launcher": asdict(ProcessInfo.current()) if launcher in ON_THIS_MACHINE else None}
         # Also if it was resumed with --trust.
         is_told = Multirun.repeats is not None and Multirun.is_trusted

@@ -1,5 +1,6 @@
 """Runs that are killed at any moment, and resumed: real processes, ended by `kill -9`."""
 
+import contextlib
 import json
 import os
 import random
@@ -14,6 +15,7 @@ import pytest
 
 import armscan
 from armscan.tracking.outbox import Address, Outbox
+from armscan.tracking.sync import begin_outbox
 from armscan.tracking.tags import GRID_TAG
 from armscan.training import load_checkpoint
 from armscan.utils.files import sha256
@@ -338,6 +340,14 @@ def test_resume_refuses_a_grid_that_has_finished(answer, cut_off):
     client.set_tag(run_id, GRID_TAG, "[]")
     client.set_terminated(run_id, "FINISHED")
     assert f"run {run_id} has finished: there is nothing to resume" in refused(answer, f"resume={run_id}")
+
+
+def test_resume_refuses_a_grid_whose_launcher_is_alive(answer, cut_off, tmp_path):
+    client, run_id, _ = cut_off
+    client.set_tag(run_id, GRID_TAG, "[]")
+    (tmp_path / "grid").mkdir()
+    with contextlib.closing(begin_outbox(tmp_path / "grid", run_id, client.uri)):
+        assert f"run {run_id} is still running, in process {os.getpid()}" in refused(answer, f"resume={run_id}")
 
 
 def test_resume_refuses_a_grid_whose_jobs_would_be_tracked_elsewhere(answer, cut_off, tmp_path):

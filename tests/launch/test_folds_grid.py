@@ -80,6 +80,21 @@ def test_experiment_may_ask_for_folds(folder, prefix):
     assert with_folds([*words, "data.folds=null"]) == [*words, "data.folds=null"]
 
 
+def test_several_experiments_may_ask_for_the_same_folds(folder):
+    words = ["data=mixed", f"data.path={folder}"]
+    several = ["experiment=few_wrists,few_wrists_sac", *words]
+    assert with_folds(["-m", *several]) == ["-m", *several, "data.fold=0,1"]
+    with pytest.raises(InvalidValueError, match=r"differ in data.folds \(None or leave_one_out\) or in their volumes"):
+        with_folds(["-m", "experiment=few_wrists,best_y", *words])
+
+
+def test_plan_refuses_what_hydra_cannot_compose_without_the_varied_keys(folder):
+    with pytest.raises(
+        InvalidValueError, match=r"needs data=nifti .*; Hydra first composes a grid without experiment,"
+    ):
+        print_grid_plan(["-m", "experiment=few_wrists,few_wrists_sac", f"data.path={folder}", "--plan"])
+
+
 @pytest.mark.parametrize(
     "words",
     [
@@ -193,11 +208,30 @@ def test_folds_of_different_tasks_have_no_best(tmp_path, database, capsys, key, 
         outcomes[str(number)] = JobOutcome(words, words, metrics={})
         of_run = {"tags": {"job": str(number), "folder": str(folder)}, "params": {key: value, "data.fold": fold}}
         runs.append(SimpleNamespace(data=SimpleNamespace(**of_run)))
-    parent = {"overrides": ["data.fold=0,1", f"{key}={','.join(values)}"], "common": [], "run_id": run_id}
+    parent = {
+        "overrides": ["data.fold=0,1", f"{key}={','.join(values)}"],
+        "common": [],
+        "run_id": run_id,
+        "has_known_jobs": True,
+    }
     keep_tables(jobs_table(outcomes, {}, have_same_task=False), tmp_path, parent, outcomes, runs, store)
     said = capsys.readouterr()
     assert said.err == ""
     assert ("best of 2" in said.out) == (key == "agent")
+
+
+@pytest.mark.parametrize("key", ["seed", "data.fold"])
+def test_page_of_an_interrupted_grid_counts_the_jobs_that_were_planned(tmp_path, database, capsys, key):
+    store, experiment_id = store_in(tmp_path, "a")
+    run_id = store.create_run(experiment_id, name="grid", tags={}).info.run_id
+    outcomes = {"0": JobOutcome("", f"{key}=0", metrics={}), "1": JobOutcome("", f"{key}=1", failure="interrupted")}
+    parent = {"overrides": [f"{key}=0,1,2,3"], "common": [], "run_id": run_id, "has_known_jobs": True}
+    keep_tables(jobs_table(outcomes, {}, have_same_task=False), tmp_path, parent, outcomes, [], store)
+    assert capsys.readouterr() == ("note: 3 of 4 jobs have no result\n", "")
+    page = (tmp_path / RESULTS_PAGE).read_text()
+    assert "<h1>Grid of 4 jobs</h1>" in page
+    assert "<p>3 of 4 jobs have no result</p>" in page
+    assert store.get_run(run_id).data.tags[DESCRIPTION_TAG].startswith("3 of 4 jobs have no result\n\n")
 
 
 @pytest.mark.parametrize(

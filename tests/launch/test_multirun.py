@@ -59,7 +59,9 @@ def test_job_that_was_stopped_alone_has_not_failed(tmp_path, database, monkeypat
     parent = store.create_run(experiment_id, name="multirun", tags={}).info.run_id
     tracking = {"uri": store.uri, "experiment": "a", "artifacts": str(tmp_path / "artifacts"), "wait_s": 60.0}
     of_grid = {"run_id": parent, "tracking": tracking, "overrides": ["seed=0,1"], "common": [], "repeats": None}
-    (tmp_path / PARENT_FILE).write_text(json.dumps(of_grid | {"is_trusted": True, "trust": False}))
+    (tmp_path / PARENT_FILE).write_text(
+        json.dumps(of_grid | {"is_trusted": True, "trust": False, "has_known_jobs": True})
+    )
     (tmp_path / OUTCOME_FOLDER).mkdir()
     jobs = []
     for number, failure in enumerate((INTERRUPTED, None)):
