@@ -50,8 +50,8 @@ def with_folds(arguments: Sequence[str]) -> list[str]:
     if len(wanted) > 1:
         of_jobs = listed(sorted({str(folds) for folds, *_ in wanted}))
         raise InvalidValueError(
-            f"the jobs of this grid differ in {FOLDS} ({of_jobs}) or in their volumes, but all jobs of a grid share their "
-            "folds: start a grid for each"
+            f"the jobs of this grid differ in {FOLDS} ({of_jobs}) or in their volumes, but all jobs of a grid share "
+            "their folds: start a grid for each"
         )
     ((folds, path, n_volumes),) = wanted
     # Deferred: command-line errors are reported before these are loaded.
