@@ -62,9 +62,9 @@ class PlaneGeometry(nn.Module):
         local = _turned_back(matrices, normals)
         sign = torch.where(local[:, 1:2] < 0.0, -1.0, 1.0)
         local = local * sign
-        distance = ((middles - (matrices @ self.middle + origins)) * normals).sum(1, keepdim=True) * sign
-        across = _turned_back(matrices, middles - origins)[:, :1] - self.middle[0]
-        return torch.cat([local[:, :1], local[:, 2:], distance, across], dim=1)
+        distance_mm = ((middles - (matrices @ self.middle + origins)) * normals).sum(1, keepdim=True) * sign
+        across_mm = _turned_back(matrices, middles - origins)[:, :1] - self.middle[0]
+        return torch.cat([local[:, :1], local[:, 2:], distance_mm, across_mm], dim=1)
 
     def from_frame(self, planes: Tensor, seen: Tensor, beside_mm: Tensor) -> Tensor:
         """Return the planes that lie at `seen` in the frames of `planes`, moved along their normals; shape (n, 4).
@@ -80,9 +80,9 @@ class PlaneGeometry(nn.Module):
         local = torch.cat([tilt[:, :1], upright, tilt[:, 1:]], dim=1)
         # Start at the nearest point of the plane, and move along the projection of the across axis onto it.
         step = torch.eye(3, dtype=seen.dtype, device=seen.device)[0] - local * local[:, :1]
-        distance = seen[:, 2:3] + beside_mm[:, None]
-        across = seen[:, 3:4].clamp(-MAX_ACROSS_MM, MAX_ACROSS_MM) - distance * local[:, :1]
-        points = self.middle + distance * local + step * (across / step[:, :1].clamp(min=1.0 - MAX_TILT**2))
+        distance_mm = seen[:, 2:3] + beside_mm[:, None]
+        across_mm = seen[:, 3:4].clamp(-MAX_ACROSS_MM, MAX_ACROSS_MM) - distance_mm * local[:, :1]
+        points = self.middle + distance_mm * local + step * (across_mm / step[:, :1].clamp(min=1.0 - MAX_TILT**2))
         matrices = _matrices(planes)
         return self.through(_turned(matrices, local), _turned(matrices, points) + _origins(planes))
 
@@ -110,16 +110,16 @@ class PlaneGeometry(nn.Module):
         step = torch.where(across.abs() < TINY, TINY, across)
         ends = torch.stack([-origins / step, (self.bounds[2:] - origins) / step])
         lowest, highest = ends.amin(0).amax(1), ends.amax(0).amin(1)
-        distance = torch.minimum(lowest.clamp(min=0.0), torch.maximum(highest, lowest))
-        slid = origins + distance[:, None] * across
+        distance_mm = torch.minimum(lowest.clamp(min=0.0), torch.maximum(highest, lowest))
+        slid = origins + distance_mm[:, None] * across
         return torch.minimum(slid.clamp(min=0.0), self.bounds[2:])
 
     def errors(self, planes: Tensor, optima: Tensor) -> Tensor:
         """Return how far planes are from the labelled ones, in mm and degrees, shape (n, 2); see `plane_distance`."""
         normals = self.normals(optima)
-        distance = ((self.middles(planes) - self.middles(optima)) * normals).sum(1).abs()
+        distance_mm = ((self.middles(planes) - self.middles(optima)) * normals).sum(1).abs()
         cross = torch.linalg.cross(self.normals(planes), normals).norm(dim=1)
-        return torch.stack([distance, torch.rad2deg(torch.asin(cross.clamp(max=1.0)))], dim=1)
+        return torch.stack([distance_mm, torch.rad2deg(torch.asin(cross.clamp(max=1.0)))], dim=1)
 
 
 def common_geometry(rules: Rules, n_looks: int) -> PlaneGeometry:

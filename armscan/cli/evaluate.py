@@ -13,7 +13,7 @@ from armscan.cli.options import (
     FILE_PATH,
     clustering_option,
     examples,
-    import_from_here,
+    allow_imports_from_working_folder,
     is_given,
     tracking_option,
     trust_option,
@@ -132,7 +132,7 @@ def evaluate(
     if agent is None:
         source = evaluation.agent_of_run(tracking, run[0], changes, trust=trust)
     else:
-        import_from_here()
+        allow_imports_from_working_folder()
         overrides = [f"agent={agent}", *run, *(["data=nifti"] if folder else [])]
         check_choices(overrides)
         source = evaluation.agent_of_overrides(overrides, folder, changes)
@@ -148,10 +148,10 @@ def evaluate(
 def _record(prepared: PreparedAgent, n_episodes: int, seed: int, out: Path | None) -> None:
     """Record a video, and print where it is."""
     from armscan.evaluation.video import record_video
-    from armscan.experiment.console import from_here
+    from armscan.experiment.console import path_to_type
 
     for file in record_video(prepared, n_episodes=n_episodes, seed=seed, out=out):
-        print(f"look at   {from_here(file)}")
+        print(f"look at   {path_to_type(file)}")
 
 
 def _evaluate(

@@ -9,7 +9,7 @@ import click
 
 from armscan.cli.data import data
 from armscan.cli.evaluate import evaluate
-from armscan.cli.options import import_from_here
+from armscan.cli.options import allow_imports_from_working_folder
 from armscan.cli.policy import policy
 from armscan.cli.report import report
 from armscan.cli.runs import runs
@@ -40,7 +40,7 @@ def run(ctx: click.Context) -> int:
     """
     from armscan.run import main
 
-    import_from_here()
+    allow_imports_from_working_folder()
     sys.argv[1:] = ctx.args
     return main()
 

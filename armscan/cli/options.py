@@ -118,14 +118,14 @@ storage_option = partial(
 )
 
 
-def import_from_here() -> None:
+def allow_imports_from_working_folder() -> None:
     """Allow imports of the user's own classes from the current folder, as `python -m` does."""
     sys.path.insert(0, str(Path.cwd()))
 
 
 def _trusting(ctx: click.Context, option: click.Parameter, trust: bool) -> bool:
     if trust:
-        import_from_here()
+        allow_imports_from_working_folder()
     return trust
 
 

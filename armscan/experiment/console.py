@@ -97,11 +97,11 @@ def print_where_to_look(
         files: Files worth looking at, relative to the folder. Default: the folder itself.
     """
     for file in files:
-        print(f"look at   {from_here(folder / file)}")
+        print(f"look at   {path_to_type(folder / file)}")
     print(f"all runs  {armscan_command('ui', tracking=tracking_uri, storage=storage)}")
 
 
-def from_here(path: Path) -> Path:
+def path_to_type(path: Path) -> Path:
     """Return a path as one would type it in the folder that the command was started in."""
     here = Path.cwd()
     if not path.is_relative_to(here):
