@@ -11,9 +11,9 @@ import click
 
 from armscan.cli.options import (
     FILE_PATH,
+    allow_imports_from_working_folder,
     clustering_option,
     examples,
-    allow_imports_from_working_folder,
     is_given,
     tracking_option,
     trust_option,
