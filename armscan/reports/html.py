@@ -49,6 +49,12 @@ summary {{ cursor: pointer; font-weight: bold; margin: 1rem 0; }}
 .videos {{ display: grid; grid-template-columns: repeat(auto-fill, minmax(15rem, 1fr)); gap: 1rem; }}
 .videos figure {{ margin: 0; max-width: 20rem; }}
 .videos img {{ width: 100%; }}
+@page {{ size: 1240px 1754px; margin: 40px; }}
+@media print {{
+  .table, .chart {{ overflow: visible; }}
+  .chart, tr {{ break-inside: avoid; }}
+  .modebar {{ display: none !important; }}
+}}
 @media (max-width: 640px) {{
   body {{ margin: .5rem auto; padding: 0 .7rem; }}
   .matrix {{ font-size: 12px; }}

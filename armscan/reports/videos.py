@@ -20,6 +20,8 @@ PROGRAM = """
     video.src = URL.createObjectURL(new Blob([contents[number]], {type: "image/gif"}));
   });
   document.querySelector("#start").addEventListener("click", start);
+  // A page that is printed has them, too.
+  start();
   new IntersectionObserver((seen, observer) => {
     if (seen.some((each) => each.isIntersecting)) { observer.disconnect(); start(); }
   }).observe(document.querySelector(".videos"));

@@ -22,7 +22,7 @@ OF_TRIAL = {names.LEASE, names.CONFIG_SHA256, names.FINALIST}
 HIDDEN_OF_STUDY = names.OF_STUDY | {names.STUDY_RUN, names.NOTE_SUM, names.RESET_FAILURES}
 # The note has the run, the folder and the metrics of the seeds.
 HIDDEN = {
-    *(names.LEASE, names.METRICS, names.SEEDS, names.CONFIG_SHA256),
+    *(names.LEASE, names.METRICS, names.SEEDS, names.CONFIG_SHA256, names.OF_CONFIG),
     *(names.ATTEMPT, names.RETRIED, names.DROPPED, names.RUN, names.FOLDER, names.PRUNED_AT),
 }
 NAMES = {

@@ -55,10 +55,11 @@ def image():
 def containers(request, postgres_programs, postgres_there, tmp_path):
     """Yield the services on this machine; PostgreSQL is running, as its image leaves it at its first start."""
     given = (tmp_path, postgres_there.port, postgres_programs, PASSWORD)
+    reached = {"MLFLOW_HOSTS": "there:5000,localhost:*", "MLFLOW_ORIGINS": "http://there:5000"}
     if request.param == "image":
-        services = ImageContainers(request.getfixturevalue("image"), *given, ARMSCAN_WORDS=TRAININGS)
+        services = ImageContainers(request.getfixturevalue("image"), *given, **reached, ARMSCAN_WORDS=TRAININGS)
     else:
-        services = Containers(*given, ARMSCAN_WORDS=TRIALS)
+        services = Containers(*given, **reached, ARMSCAN_WORDS=TRIALS)
     postgres_there.execute(f"CREATE DATABASE {services.services['postgres']['environment']['POSTGRES_DB']}")
     postgres_there.execute((FOLDER / "databases.sql").read_text())
     try:
@@ -67,10 +68,10 @@ def containers(request, postgres_programs, postgres_there, tmp_path):
         services.stop_all()
 
 
-def asked(url, **headers):
+def asked(url, posted=None, **headers):
     """Return the status and the body of an answer."""
     try:
-        with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=HANG_S) as answer:
+        with urllib.request.urlopen(urllib.request.Request(url, posted, headers), timeout=HANG_S) as answer:
             return answer.status, answer.read()
     except urllib.error.HTTPError as error:
         return error.code, error.read()
@@ -130,6 +131,16 @@ def test_study_on_the_services_is_stopped_and_gone_on_with(containers, postgres_
     for name, url in asked_for.items():
         for host, status in ((name, 200), ("localhost", 200), ("elsewhere", 403)):
             assert asked(url, Host=f"{host}:{containers.ports[name]}")[0] == status, (name, host)
+    # MLflow's pages search by POST.
+    there = f"there:{containers.ports['mlflow']}"
+    search = asked_for["mlflow"].partition("?")[0], b'{"max_results": 1}'
+    for origin, status in (
+        (f"http://{there}", 200),
+        (f"http://localhost:{containers.ports['mlflow']}", 200),
+        ("http://a", 403),
+    ):
+        headers = {"Host": there, "Origin": origin, "Content-Type": "application/json"}
+        assert asked(*search, **headers)[0] == status, origin
 
     n_before = n_connections(postgres_there)
     assert not containers.is_healthy("worker")
@@ -160,6 +171,9 @@ def test_study_on_the_services_is_stopped_and_gone_on_with(containers, postgres_
     assert [file.read_text() for file in containers.folder.glob("artifacts/**/note.txt")] == ["kept"]
     assert {each.name for each in containers.folder.glob("work/*")} >= {"studies", "optuna.artifacts"}
     assert PASSWORD not in "".join(containers.log(name) for name in ("mlflow", "dashboard", "worker"))
+    assert containers.is_healthy("mlflow")
+    postgres_there.stop()
+    assert not containers.is_healthy("mlflow")
 
 
 def test_entry_refuses_a_password_that_cannot_be_read(tmp_path):

@@ -19,6 +19,7 @@ KEPT = {
     "figures": {"mean_steps": 3.0},
     "seeds": {"0": {"mean_steps": 3.0}},
     "config_sha256": "0" * 64,
+    "study_config_sha256": "0" * 64,
     "mlflow_run": "1" * 32,
     "folder": "studies/a/trials/0000",
 }

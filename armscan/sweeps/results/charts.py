@@ -168,7 +168,9 @@ def key_axis(key: str, distribution: BaseDistribution) -> dict[str, Any]:
     ends = (math.log10(limits.low), math.log10(limits.high)) if limits.log else (limits.low, limits.high)
     # Room for the markers at both ends.
     margin = MARGIN * (ends[1] - ends[0])
-    how = {"type": "log", "exponentformat": "power", "dtick": 1} if limits.log else {}
+    # Of less than two decades, powers of ten alone would be few: 1, 2 and 5 are labelled.
+    ticks = {"dtick": "D2"} if ends[1] - ends[0] < 2 else {"dtick": 1, "exponentformat": "power"}
+    how = {"type": "log", **ticks} if limits.log else {}
     return {"title": key, "range": [ends[0] - margin, ends[1] + margin], **how}
 
 

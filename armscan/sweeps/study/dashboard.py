@@ -84,11 +84,17 @@ def shown_metrics(metrics: Mapping[str, float], n_seeds: int) -> dict[str, float
     return {f"{of}{title_of(name)}{statistic}": float(f"{chosen[name]:.4g}") for name in names}
 
 
-def named_as_of_runs(metrics: Mapping[str, float], n_seeds: int) -> dict[str, float]:
-    """Return a trial's leading metrics by the names that runs use, so that MLflow shows them in the same columns."""
-    of_phases = {"validation": metrics, TEST_METRICS: metrics_of_test(metrics)}
-    named = {f"{of}/{name}": each[name] for of, each in of_phases.items() for name in leading_among(each)}
-    return named | ({f"validation/{SEEDS}": float(n_seeds)} if n_seeds > 1 and metrics else {})
+def named_as_of_runs(metrics: Mapping[str, float], n_seeds: int, prefix: str) -> dict[str, float]:
+    """Return a trial's leading metrics by the names that runs use, so that MLflow shows them in the same columns.
+
+    Args:
+        metrics: Metrics of the trial, those on the test volumes by names of their own.
+        n_seeds: Number of its seeds.
+        prefix: Prefix of the others: `validation/`, or `selection/` in the race over seeds, whose episodes are others.
+    """
+    of_phases = {prefix: metrics, f"{TEST_METRICS}/": metrics_of_test(metrics)}
+    named = {f"{of}{name}": each[name] for of, each in of_phases.items() for name in leading_among(each)}
+    return named | ({f"{prefix}{SEEDS}": float(n_seeds)} if n_seeds > 1 and metrics else {})
 
 
 def show_picture(trial: Trial, picture: Path, artifacts: Path) -> None:

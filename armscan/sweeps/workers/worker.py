@@ -23,6 +23,7 @@ from armscan.sweeps.scheduling.limits import LimitReachedError
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.attribute_names import CONFIG_SHA256, ENV_STEPS, FAILURE, FOLDER, METRICS, RUN
+from armscan.sweeps.storage.attributes import SELECTION_SUFFIX
 from armscan.sweeps.study.components import make, read_settings
 from armscan.sweeps.study.dashboard import named_as_of_runs, note_run, show_picture, shown_metrics, table_of_seeds
 from armscan.sweeps.study.open import open_for_work
@@ -31,6 +32,7 @@ from armscan.sweeps.tasks.attempt import Attempt, check_metrics, config_sha256, 
 from armscan.sweeps.workers.heartbeat import Heartbeat
 from armscan.sweeps.workers.trial_run import close_requeued, open_run
 from armscan.tracking import TrackedRun
+from armscan.tracking.tags import SELECTION_PREFIX
 from armscan.utils.log import log, silence_libraries
 
 WAIT_S = 1.0
@@ -194,7 +196,8 @@ class Worker:
             self._phase.remove_checkpoints(trial)
         if tracked is None:
             return
-        named = named_as_of_runs(metrics, len(self._phase.seeds_of(trial)))
+        prefix = SELECTION_PREFIX if self._phase.name.endswith(SELECTION_SUFFIX) else "validation/"
+        named = named_as_of_runs(metrics, len(self._phase.seeds_of(trial)), prefix)
         tracked.log_metrics(metrics | named, n_env_steps=0)
         if state == TrialState.PRUNED:
             tracked.set_pruned()

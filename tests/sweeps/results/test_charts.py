@@ -9,7 +9,7 @@ from optuna.study import StudyDirection
 from optuna.trial import create_trial
 
 from armscan.reports.chart_style import BLUE, GREY
-from armscan.sweeps.results.charts import _history, _slice, charts_of
+from armscan.sweeps.results.charts import _history, _slice, charts_of, key_axis
 
 
 def test_best_so_far_is_of_trials_that_satisfy_all_constraints():
@@ -56,3 +56,9 @@ def test_names_of_objectives_in_a_storage_are_escaped():
     shown = "".join(charts_of(study, study.trials, [name], []))
     assert "<script>alert" not in shown
     assert html.escape(name) in shown
+
+
+@pytest.mark.parametrize(("low", "high", "labelled"), [(0.05, 0.5, "D2"), (1e-4, 1e-2, 1)])
+def test_axis_of_a_short_logarithmic_range_has_more_numbers_than_powers_of_ten(low, high, labelled):
+    axis = key_axis("agent.utd_ratio", FloatDistribution(low, high, log=True))
+    assert (axis["type"], axis["dtick"]) == ("log", labelled)

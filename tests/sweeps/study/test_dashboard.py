@@ -3,8 +3,9 @@
 import math
 
 import optuna
+import pytest
 
-from armscan.sweeps.study.dashboard import shown_metrics, table_of_seeds
+from armscan.sweeps.study.dashboard import named_as_of_runs, shown_metrics, table_of_seeds
 from armscan.sweeps.study.study import name_objectives
 
 METRICS = {
@@ -40,6 +41,19 @@ def test_shown_metrics_are_few_and_say_their_statistic():
     }
     assert "steps, mean (IQM of 2 seeds)" in shown_metrics(METRICS, 2)
     assert shown_metrics({"test/mean_steps": 2.0, **METRICS}, 1) == {"test volumes: steps, mean": 2.0}
+
+
+@pytest.mark.parametrize("prefix", ["validation/", "selection/"])
+def test_metrics_of_a_trial_have_the_names_of_runs_and_those_of_the_race_names_of_their_own(prefix):
+    named = named_as_of_runs(METRICS | {"test/mean_steps": 2.0}, 2, prefix)
+    assert named["test_volumes/mean_steps"] == 2.0
+    assert {name: value for name, value in named.items() if "test" not in name} == {
+        f"{prefix}on_plane_5mm_10deg": 0.9375,
+        f"{prefix}median_distance_mm": 1.23456789,
+        f"{prefix}success_rate": 1.0,
+        f"{prefix}mean_steps": 3.0,
+        f"{prefix}seeds": 2.0,
+    }
 
 
 def test_objectives_have_names_also_in_a_study_that_has_none_yet():
