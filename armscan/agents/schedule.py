@@ -49,6 +49,8 @@ def read_schedule(described: Any, total_env_steps: int) -> tuple[Segment, ...]:
         start = check_int(f"{of_each}.{FROM}", each.get(FROM), at_least=after + 1, at_most=total_env_steps - 1)
         if wrong := [key for key in each if key != FROM and not str(key).startswith(AGENT)]:
             raise InvalidValueError(f"there is no key {wrong[0]!r} in {of_each}, but only {FROM} and keys of agent")
+        if len(each) == 1:
+            raise InvalidValueError(f"{of_each} changes nothing: give keys of agent, such as {AGENT}lr, beside {FROM}")
         segments.append(Segment(start, {key.removeprefix(AGENT): each[key] for key in each if key != FROM}))
     return tuple(segments)
 

@@ -8,8 +8,8 @@ from armscan.anatomy.rewards import (
     AgreementReward,
     LandmarkReward,
     Reward,
-    check_reward,
     check_targets,
+    fitted_reward,
     landmark_reward,
 )
 from armscan.anatomy.scanner import Scanner
@@ -44,10 +44,10 @@ __all__ = [
     "Tissue",
     "TissueClusters",
     "Tissues",
-    "check_reward",
     "check_targets",
     "check_tissues",
     "find_optimal_plane",
+    "fitted_reward",
     "is_coarse",
     "landmark_reward",
     "nerve_area_error",

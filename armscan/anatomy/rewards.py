@@ -224,13 +224,28 @@ def check_targets(targets: Sequence[int]) -> tuple[int, int, int]:
     return bones, tendons, artery
 
 
-def check_reward(reward: Reward | None, targets: Sequence[int]) -> Reward:
-    """Return the given reward, or the published one with these targets if it is None."""
+def fitted_reward(
+    reward: Reward | None, targets: Sequence[int], volumes: Iterable[LabelVolume], tissues: Tissues
+) -> Reward:
+    """Return a reward, or the published one with these targets if it is None, fitted to volumes.
+
+    Raises:
+        InvalidValueError: If there are targets beside a reward, or the reward, or what its `fit` returns, is none.
+    """
     targets = check_targets(targets)
     if reward is None:
         return LandmarkReward(targets)
     if targets != PUBLISHED_TARGETS:
         raise InvalidValueError(f"targets is {targets} and a reward is given, too, but only one of them may be")
-    if isinstance(reward, type) or not all(callable(getattr(reward, name, None)) for name in ("fit", "score")):
+    if not _is_reward(reward):
         raise InvalidValueError(f"reward is {reward!r}, but it must be an object with the methods of Reward")
-    return reward
+    fitted = reward.fit(volumes, tissues)
+    if not _is_reward(fitted):
+        raise InvalidValueError(
+            f"{type(reward).__name__}.fit returned {fitted!r}, but it must return a fitted reward, such as itself"
+        )
+    return fitted
+
+
+def _is_reward(reward: object) -> bool:
+    return not isinstance(reward, type) and all(callable(getattr(reward, name, None)) for name in ("fit", "score"))

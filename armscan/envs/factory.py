@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 from gymnasium.vector import VectorEnv
 
-from armscan.anatomy import PUBLISHED_TARGETS, check_reward, check_tissues
+from armscan.anatomy import PUBLISHED_TARGETS, check_tissues, fitted_reward
 from armscan.envs.env import ArmscanEnv
 from armscan.envs.history import MAX_KEPT, boxes_of, check_exclusions
 from armscan.envs.rules import Rules, Volumes
@@ -41,10 +41,9 @@ class EnvFactory:
     def fit(self, volumes: Mapping[str, LabelVolume]) -> EnvFactory:
         """Return a factory whose reward is fitted to these volumes; its environments may have other volumes."""
         tissues = check_tissues(self.rules.get("clustering", "pixels"))
-        reward = check_reward(self.rules.get("reward"), self.rules.get("targets", PUBLISHED_TARGETS))
-        return EnvFactory(
-            **self.rules | {"reward": reward.fit(volumes.values(), tissues), "targets": PUBLISHED_TARGETS}
-        )
+        given = self.rules.get("reward"), self.rules.get("targets", PUBLISHED_TARGETS)
+        reward = fitted_reward(*given, volumes.values(), tissues)
+        return EnvFactory(**self.rules | {"reward": reward, "targets": PUBLISHED_TARGETS})
 
     def undeformed(self) -> EnvFactory:
         """Return a factory of environments that move volumes without deforming them, as evaluations do."""

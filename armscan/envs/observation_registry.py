@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
+import numpy as np
 from gymnasium import spaces
 
 from armscan.anatomy import PUBLISHED_TARGETS
@@ -38,6 +39,7 @@ class MergedObservation:
     def __init__(self, observations: Sequence[ObservationLike], *, targets: Sequence[int] = PUBLISHED_TARGETS) -> None:
         if isinstance(observations, str) or not isinstance(observations, Sequence) or not observations:
             raise InvalidValueError(f"observations is {observations!r}, but it must be a list of at least one")
+        self._boxes: dict[str, spaces.Box] = {}
         checked = [_observation(observation, targets) for observation in observations]
         self.observations: tuple[Observation, ...] = tuple(
             member
@@ -54,18 +56,43 @@ class MergedObservation:
         merged: dict[str, spaces.Box] = {}
         for observation in self.observations:
             parts = observation.spaces(geometries, n_action)
+            if not isinstance(parts, Mapping):
+                raise InvalidValueError(
+                    f"{type(observation).__name__}.spaces returned {parts!r}, but it must return a Box for each part"
+                )
             if twice := sorted(merged.keys() & parts.keys()):
                 raise InvalidValueError(f"merged observations both have the key {listed(twice)}")
             merged.update(parts)
+        self._boxes = merged
         return merged
 
     def observe(self, view: View) -> Parts:
         """See `Observation.observe`."""
-        return {key: part for observation in self.observations for key, part in observation.observe(view).items()}
+        of_each = [self._checked(each, each.observe(view)) for each in self.observations]
+        return {key: part for parts in of_each for key, part in parts.items()}
 
     def observe_all(self, views: Sequence[View]) -> Parts:
         """See `observe_all`."""
-        return {key: part for each in self.observations for key, part in observe_all(each, views).items()}
+        of_each = [self._checked(each, observe_all(each, views)) for each in self.observations]
+        return {key: part for parts in of_each for key, part in parts.items()}
+
+    def _checked(self, observation: Observation, parts: Parts) -> Parts:
+        """Return the parts of an observation; those of a user's own must lie in their spaces."""
+        if type(observation) in OURS:
+            return parts
+        name = type(observation).__name__
+        if not isinstance(parts, Mapping):
+            raise InvalidValueError(f"{name}.observe returned {parts!r}, but it must return an array for each part")
+        for key, part in parts.items():
+            box, values = self._boxes.get(key), np.asarray(part)
+            # Missing parts and wrong shapes are reported when the observation is put together.
+            if box is None or values.shape[values.ndim - len(box.shape) :] != box.shape:
+                continue
+            is_whole = np.issubdtype(box.dtype, np.floating) or np.issubdtype(values.dtype, np.integer)
+            # A NaN is not within any bounds.
+            if not is_whole or not ((box.low <= values) & (values <= box.high)).all():
+                raise InvalidValueError(f"{name}.observe gave {values!r} as {key}, but its space is {box}")
+        return parts
 
 
 NAMED_OBSERVATIONS: dict[str, type[Observation]] = {
@@ -75,6 +102,9 @@ NAMED_OBSERVATIONS: dict[str, type[Observation]] = {
     "slice_channels": SliceChannelsObservation,
     "slice_metric": MetricSliceObservation,
 }
+
+
+OURS = frozenset(NAMED_OBSERVATIONS.values())
 
 
 def with_action_reward(observation: ObservationLike, targets: Sequence[int] = PUBLISHED_TARGETS) -> Observation:

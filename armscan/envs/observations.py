@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple, Protocol
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from armscan.anatomy import PUBLISHED_TARGETS, USUAL_PIXEL_MM, Landmarks, TissueClusters, Tissues, check_targets
 from armscan.envs.spaces import Parts
+from armscan.errors import InvalidValueError
 from armscan.utils.arrays import FloatArray
 from armscan.utils.compilation import cached_njit
 from armscan.utils.validation import check_bool
@@ -83,6 +84,9 @@ def observe_all(observation: Observation, views: Sequence[View]) -> Parts:
         parts: Parts = observe_them(views)
         return parts
     observed = [observation.observe(view) for view in views]
+    if not all(isinstance(parts, Mapping) for parts in observed):
+        name = type(observation).__name__
+        raise InvalidValueError(f"{name}.observe returned {observed!r}, but it must return an array for each part")
     return {name: np.stack([parts[name] for parts in observed]) for name in observed[0]}
 
 

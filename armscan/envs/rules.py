@@ -17,8 +17,8 @@ from armscan.anatomy import (
     Reward,
     Scanner,
     Tissues,
-    check_reward,
     check_tissues,
+    fitted_reward,
 )
 from armscan.envs.actions import COMPONENTS, STOP, ActionBounds, free_components
 from armscan.envs.observation_registry import ObservationLike, with_action_reward
@@ -68,7 +68,7 @@ class Rules:
         self.max_steps = check_int("max_steps", max_steps, at_least=1)
         self.start = check_choice("start", start, STARTS)
         self.tissues = check_tissues(clustering)
-        self.reward = check_reward(reward, targets).fit(self.volumes.values(), self.tissues)
+        self.reward = fitted_reward(reward, targets, self.volumes.values(), self.tissues)
         rotation = check_numbers("rotation_bounds_deg", rotation_bounds_deg, 2, "for rz and rx")
         if translation_bounds_mm is not None:
             translation = check_numbers("translation_bounds_mm", translation_bounds_mm, 2, "for tx and ty")

@@ -122,9 +122,10 @@ def test_learning_rates_are_those_of_the_schedule_and_not_of_the_checkpoint(make
             "training.schedule[0].from_env_steps is 100, but it must be a whole number of at least",
         ),
         (
-            [{"from_env_steps": 9}] * 2,
+            [{"from_env_steps": 9, "agent.lr": 1}] * 2,
             "training.schedule[1].from_env_steps is 9, but it must be a whole number of at least 10",
         ),
+        ([{"from_env_steps": 9}], "training.schedule[0] changes nothing: give keys of agent, such as agent.lr, beside"),
         ([{"from_env_steps": 9, "lr": 1}], "there is no key 'lr' in training.schedule[0], but only from_env_steps and"),
     ],
 )

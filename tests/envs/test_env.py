@@ -214,6 +214,11 @@ def test_reset_takes_the_volume_as_an_option(dataset):
         env.reset(options={"speed": 1})
 
 
+class Unfitted(LandmarkReward):
+    def fit(self, volumes, tissues=None):
+        pass
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -234,6 +239,7 @@ def test_reset_takes_the_volume_as_an_option(dataset):
         ({"flat": "yes"}, "flat is 'yes'"),
         ({"reward": "best"}, "reward is 'best'"),
         ({"reward": LandmarkReward}, "reward is <class"),
+        ({"reward": Unfitted()}, "Unfitted.fit returned None, but it must return a fitted reward"),
         ({"reward": LandmarkReward(), "targets": (7, 5, 1)}, "only one of them"),
         ({"render_mode": "sound"}, "render_mode is 'sound'"),
         ({"volumes": []}, "volumes is empty"),

@@ -1,5 +1,7 @@
 """Observations."""
 
+from functools import partial
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -192,6 +194,38 @@ def test_own_observation_that_gives_other_parts_is_refused(phantom, parts, messa
     env = ArmscanEnv([phantom], observation=Careless(parts), flat=flat)
     with pytest.raises(InvalidValueError, match=message):
         env.reset(seed=0)
+
+
+@pytest.mark.parametrize("n_envs", [None, 2])
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        (None, "Other.observe returned .*None.*, but it must return an array for each part"),
+        ({"a": np.float32([np.nan]), "b": np.uint8([7])}, r"Other.observe gave .*nan.* as a, but its space is Box\(0"),
+        ({"a": np.float32([1.5]), "b": np.uint8([7])}, r"gave .*1\.5.* as a, but its space is Box\(0"),
+        ({"a": np.float32([0.5]), "b": np.array([7.7])}, r"gave .*7\.7.* as b, but its space is Box\(0, 255"),
+    ],
+)
+def test_own_observation_outside_of_its_space_is_refused(phantom, parts, message, n_envs):
+    class Other:
+        def spaces(self, geometries, n_action):
+            return {"a": spaces.Box(0, 1, (1,), np.float32), "b": spaces.Box(0, 255, (1,), np.uint8)}
+
+        def observe(self, view):
+            return parts
+
+    make = ArmscanEnv if n_envs is None else partial(ArmscanVectorEnv, n_envs)
+    with pytest.raises(InvalidValueError, match=message):
+        make([phantom], observation=Other()).reset(seed=0)
+
+
+def test_own_observation_whose_spaces_are_no_mapping_is_refused(phantom):
+    class Other(Careless):
+        def spaces(self, geometries, n_action):
+            return spaces.Box(0, 1, (1,), np.float32)
+
+    with pytest.raises(InvalidValueError, match=r"Other.spaces returned Box.*, but it must return a Box for each part"):
+        ArmscanEnv([phantom], observation=Other({}))
 
 
 def test_cluster_observation_by_name_divides_by_the_rewards_targets(phantom):

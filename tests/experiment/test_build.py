@@ -119,3 +119,11 @@ def test_number_of_phantoms_beside_volumes_of_the_folder_is_refused(part):
         check_effects(compose(mixed), [*mixed])
     check_effects(compose([*mixed, f"data.{part}=phantoms"]), [*mixed])
     check_effects(compose([override]), [override])
+
+
+@pytest.mark.parametrize("made", [None, "sac", dict])
+def test_algorithm_that_makes_no_agent_is_refused(phantom, monkeypatch, made):
+    config = config_of_sizes(phantom, monkeypatch, "agent=random")
+    monkeypatch.setattr("armscan.agents.Random.agent", lambda *_: made)
+    with pytest.raises(InvalidValueError, match=r"the algorithm made .*, but it must make an object with the methods"):
+        build_setup(config)

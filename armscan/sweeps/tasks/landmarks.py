@@ -9,7 +9,7 @@ import numpy as np
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
-from armscan.anatomy import PlaneScorer
+from armscan.anatomy import PUBLISHED_TARGETS, PlaneScorer, fitted_reward
 from armscan.anatomy.tissues import Tissues, check_tissues
 from armscan.errors import InvalidValueError
 from armscan.experiment.build import check_keys
@@ -75,7 +75,8 @@ class LandmarksTask:
         """Return each volume's reward at the labelled plane and its mean elsewhere; training volumes fit it."""
         config, _ = attempt.config(attempt.seeds[0])
         tissues, volumes = self._tissues(config), volumes_of(config).parts
-        reward = instantiate(config.reward, _convert_="object").fit(volumes["training"].values(), tissues)
+        given = instantiate(config.reward, _convert_="object")
+        reward = fitted_reward(given, PUBLISHED_TARGETS, volumes["training"].values(), tissues)
         rewards = {}
         for name, volume in volumes[part].items():
             scorer, labelled = PlaneScorer(volume, reward, tissues), volume.optimal_action
