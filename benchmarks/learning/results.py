@@ -15,6 +15,7 @@ from __future__ import annotations
 import json
 import statistics
 import sys
+from collections.abc import Collection
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -130,10 +131,10 @@ def measure(name: str, seed: int, data: str, folder: Path) -> None:
         FIGURES.write_text(json.dumps(kept, indent=1, sort_keys=True) + "\n")
 
 
-def print_tables() -> None:
-    """Print two tables of all kept figures: the figures of each seed, and the goals."""
+def print_tables(rows: Collection[str] = tuple(ROWS)) -> None:
+    """Print two tables of the kept figures of these rows: the figures of each seed, and the goals."""
     kept = json.loads(FIGURES.read_text())
-    found = {name: [kept[name][seed] for seed in sorted(kept[name])] for name in ROWS if name in kept}
+    found = {name: [kept[name][seed] for seed in sorted(kept[name])] for name in ROWS if name in kept and name in rows}
     print_head("", *COLUMNS)
     for name, of_seeds in found.items():
         cells = (
@@ -165,18 +166,19 @@ def main(words: list[str]) -> None:
     usage = f"see the text at the head of {__file__}"
     keys = {"data", "folder", "seeds", "workers"}
     chosen, given = chosen_words(words, (*ROWS, "show"), keys, f"{usage}; rows: {' '.join(ROWS)}")
-    if "show" not in words:
+    rows = [name for name in chosen if name != "show"] or [*ROWS]
+    if "show" in chosen and given:
+        sys.exit(f"{' '.join(words)}: show measures nothing, so it takes only rows: {usage}")
+    if "show" not in chosen:
         if "data" not in given:
             sys.exit(f"give data=FOLDER, or show: {usage}")
         folder = runs_folder(given)
         seeds = [int(seed) for seed in given.get("seeds", "0,1,2").split(",")]
         with ThreadPoolExecutor(int(given.get("workers", "2"))) as pool:
-            waiting = [
-                pool.submit(measure, name, seed, given["data"], folder) for name in chosen or ROWS for seed in seeds
-            ]
+            waiting = [pool.submit(measure, name, seed, given["data"], folder) for name in rows for seed in seeds]
             for each in waiting:
                 each.result()
-    print_tables()
+    print_tables(rows if "show" in chosen else tuple(ROWS))
 
 
 if __name__ == "__main__":

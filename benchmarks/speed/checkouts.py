@@ -31,10 +31,18 @@ def parser_of(description: str, n_rounds: int | None = None) -> argparse.Argumen
     """Return a parser of the option `--before`, an absolute path or None, and of `--rounds` if it has a default."""
     parser = argparse.ArgumentParser(description=description.partition("\n")[0])
     what = "another checkout to compare with"
-    parser.add_argument("--before", type=lambda word: Path(word).resolve(), metavar="CHECKOUT", help=what)
+    parser.add_argument("--before", type=_checkout, metavar="CHECKOUT", help=what)
     if n_rounds:
         parser.add_argument("--rounds", type=int, default=n_rounds, help=f"turns of each (default: {n_rounds})")
     return parser
+
+
+def _checkout(given: str) -> Path:
+    folder = Path(given).resolve()
+    # Otherwise the installed version would be imported, and compared with itself.
+    if not (folder / "armscan" / "__init__.py").is_file():
+        raise argparse.ArgumentTypeError(f"{given} is no checkout of armscan: it has no armscan/__init__.py")
+    return folder
 
 
 def children_processor_s() -> float:

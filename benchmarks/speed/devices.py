@@ -39,22 +39,24 @@ def main() -> None:
     parser = parser_of(__doc__, n_rounds=3)
     parser.add_argument("cases", nargs="*", metavar="CASE", help="beginning of a name (default: all)")
     given = parser.parse_args()
+    cases = [case for case in CASES if not given.cases or case.startswith(tuple(given.cases))]
+    if not cases:
+        parser.error(f"{' '.join(given.cases)} begins no name: {', '.join(CASES)}")
     devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
     for device in devices:
         run(REPOSITORY, *SHORT, f"device={device}")
     ratio = ["cpu / cuda: median, least, most"] if devices[1:] else []
     print_head("agent", *(f"{device}, s" for device in devices), *ratio)
-    for case, words in CASES.items():
-        if not given.cases or case.startswith(tuple(given.cases)):
-            rounds = [
-                [run(REPOSITORY, *words, *QUICK, f"device={device}").training_wall_s for device in devices]
-                for _ in range(given.rounds)
-            ]
-            cells = [f"{statistics.median(each):.1f}" for each in zip(*rounds, strict=True)]
-            if ratio:
-                ratios = [cpu_s / cuda_s for cpu_s, cuda_s in rounds]
-                cells.append(f"{statistics.median(ratios):.2f}, {min(ratios):.2f}, {max(ratios):.2f}")
-            print_row(case, *cells)
+    for case in cases:
+        rounds = [
+            [run(REPOSITORY, *CASES[case], *QUICK, f"device={device}").training_wall_s for device in devices]
+            for _ in range(given.rounds)
+        ]
+        cells = [f"{statistics.median(each):.1f}" for each in zip(*rounds, strict=True)]
+        if ratio:
+            ratios = [cpu_s / cuda_s for cpu_s, cuda_s in rounds]
+            cells.append(f"{statistics.median(ratios):.2f}, {min(ratios):.2f}, {max(ratios):.2f}")
+        print_row(case, *cells)
 
 
 if __name__ == "__main__":

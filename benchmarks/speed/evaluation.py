@@ -152,12 +152,14 @@ def main() -> None:
     from armscan.utils.log import silence_libraries
 
     silence_libraries()
+    cases = [case for case in CASES if not given.parts or any(part in case for part in given.parts)]
+    if not cases:
+        parser.error(f"{' '.join(given.parts)} is part of no name: {', '.join(CASES)}")
     columns = ["agent", "mean steps", "side by side, s", "one by one, s", "through Tianshou, s", "ratio"]
     print_head(*columns, *(("before, s", "ratio", "its mean steps") if given.before else ()))
     with start(__file__, given.before) if given.before else nullcontext() as process:
-        for case in CASES:
-            if not given.parts or any(part in case for part in given.parts):
-                print_row(*measure(case, partial(ask, process) if process else None))
+        for case in cases:
+            print_row(*measure(case, partial(ask, process) if process else None))
 
 
 if __name__ == "__main__":

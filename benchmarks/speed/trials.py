@@ -51,7 +51,11 @@ WORDS = (
     "study.workers=1",
     "study/pruner=none",
     "study.final_eval.top_k=0",
+    # Of all checkouts; that of today has other numbers, and begins with a preset.
+    "data.n_validation=4",
+    "data.n_test=8",
 )
+WITHOUT_PRESETS = "study.enqueue=[]"
 
 
 def trial_seconds(checkout: Path, n_trials: int) -> list[float]:
@@ -59,8 +63,10 @@ def trial_seconds(checkout: Path, n_trials: int) -> list[float]:
     with tempfile.TemporaryDirectory() as folder:
         seconds = Path(folder) / "seconds.txt"
         (Path(folder) / "sitecustomize.py").write_text(SITE)
+        has_presets = "enqueue:" in (checkout / "sweeps" / "sac_y.yaml").read_text()
+        words = (*WORDS, *([WITHOUT_PRESETS] if has_presets else []), f"study.n_trials={n_trials}")
         subprocess.run(
-            [sys.executable, "-m", "armscan.run", *WORDS, f"study.n_trials={n_trials}"],
+            [sys.executable, "-m", "armscan.run", *words],
             cwd=folder,
             env=environment(f"{folder}:{checkout}", SECONDS_FILE=str(seconds)),
             stdout=subprocess.DEVNULL,

@@ -2,9 +2,10 @@
 
     python -m benchmarks.speed.updates [PART-OF-A-NAME ...]
 
-SAC on phantoms, with batches of 256: a replay buffer of random steps, then rounds of updates, in each way in turn. The
-figures to quote are the ratios to float32 without compilation on the CPU, each the median over the rounds. Uses the
-available devices; on a GPU, time ends when all queued work is done.
+SAC on phantoms, with batches of 256: a replay buffer of random steps, then rounds of Tianshou's own update, in each way
+in turn (`compiled_update.py` measures the one that Numba compiles). The figures to quote are the ratios to float32
+without torch.compile on the CPU, each the median over the rounds. Uses the available devices; on a GPU, time ends when
+all queued work is done.
 """
 
 from __future__ import annotations
@@ -16,8 +17,10 @@ os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 import statistics
 import sys
 import time
+from functools import partial
 
 import torch
+from tianshou.algorithm.modelfree import sac
 from tianshou.utils.torch_utils import policy_within_training_step
 
 from armscan.agents import MLP, SAC, Compute, Multimodal, Network
@@ -45,25 +48,26 @@ def ways() -> dict[str, Compute]:
     """Return the ways of computing that this machine has, by name."""
     devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
     return {
-        f"{device}, {precision}{', compiled' if is_compiled else ''}": Compute(device, precision, is_compiled)
+        f"{device}, {precision}{', torch.compile' if is_compiled else ''}": Compute(device, precision, is_compiled)
         for device in devices
         for precision in ("float32", "bfloat16")
         for is_compiled in (False, True)
     }
 
 
-def updater(env_factory: EnvFactory, network: Network, compute: Compute):
-    """Return a function that measures updates per second, with a filled replay buffer."""
+def updater(env_factory: EnvFactory, network: Network, compute: Compute, *, is_tianshous: bool):
+    """Return a function that measures updates per second, Tianshou's or the agent's, with a filled replay buffer."""
     setup = agent_setup(env_factory, load_phantoms(range(2)), 10 * N_RANDOM_STEPS, compute)
     learner = SAC(network=network, learning_starts=N_RANDOM_STEPS).agent(setup)
     learner.warm_up()
     algorithm, replay = learner._algorithm, learner._replay
+    update = partial(sac.SAC.update, algorithm) if is_tianshous else algorithm.update
 
     def measure(seconds: float = ROUND_S) -> float:
         n_updates, start_s = 0, time.perf_counter()
         with policy_within_training_step(algorithm.policy):
             while n_updates < 3 or time.perf_counter() - start_s < seconds:
-                algorithm.update(buffer=replay, sample_size=256)
+                update(buffer=replay, sample_size=256)
                 n_updates += 1
         if compute.torch_device == "cuda":
             torch.cuda.synchronize()
@@ -77,9 +81,11 @@ def main(words: list[str]) -> None:
     silence_libraries()
     torch.set_num_threads(1)
     chosen = {name: case for name, case in CASES.items() if not words or any(word in name for word in words)}
+    if not chosen:
+        sys.exit(f"{' '.join(words)} is part of no name: {', '.join(CASES)}")
     print_head("observation, network", "computed", "updates/s, median", "best", "beside the first")
     for name, (env_factory, network) in chosen.items():
-        measures = {way: updater(env_factory, network, compute) for way, compute in ways().items()}
+        measures = {way: updater(env_factory, network, compute, is_tianshous=True) for way, compute in ways().items()}
         for measure in measures.values():
             # Compiles.
             measure(0.0)

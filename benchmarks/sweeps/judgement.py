@@ -40,8 +40,8 @@ class Coverage(NamedTuple):
     """Shares of the studies whose interval contains the truth, for each interval of the module's docstring."""
 
     paired: float
-    bootstrap: float
     improvement: float
+    bootstrap: float
     n_studies: int
     n_trainings: float
 
@@ -86,8 +86,8 @@ def simulate(n_studies: int, n_seeds: int, n_volumes: int, effect: float) -> Cov
         held.append(
             (
                 holds(differences, truth),
-                bool(low <= truth <= high),
                 bool(improvement.low <= ndtr(truth / OF_DIFFERENCE) <= improvement.high),
+                bool(low <= truth <= high),
             )
         )
     return Coverage(*np.mean(held, axis=0), len(held), n_trainings / n_studies)
@@ -104,7 +104,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--studies", type=int, default=2000)
     n_studies = parser.parse_args().studies
-    names = "paired", "bootstrap", "improvement", "studies", "trainings to select"
+    intervals = "difference", "probability of improvement", "percentile bootstrap of the seeds"
+    names = *intervals, "studies", "trainings to select"
     print_head("seeds", "test volumes", "effect", *names)
     for n_seeds, n_volumes, effect in product(N_SEEDS, N_VOLUMES, EFFECTS):
         found = simulate(n_studies, n_seeds, n_volumes, effect)

@@ -23,6 +23,7 @@ import contextlib
 import functools
 import json
 import shutil
+import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
@@ -94,8 +95,12 @@ def same_budget(
         replicates: Number of replicates. Default: 4.
         seeds: Number of seeds that judge each configuration. Default: 8.
     """
+    if not isinstance(tasks, list | tuple) or not {*tasks} <= TASKS.keys():
+        sys.exit(f"tasks is {tasks}, but it must be a list of {', '.join(TASKS)}, such as tasks=[sac_y]")
     silence_libraries()
     results = Results(folder / "results.jsonl")
+    if not replicates and not results.rows:
+        sys.exit(f"{folder} has no results.jsonl: give the folder of a comparison, or replicates=N")
     with contextlib.chdir(folder):
         for replicate in range(first, first + replicates):
             for name in tasks:

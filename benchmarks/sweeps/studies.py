@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import subprocess
 import sys
 import tempfile
@@ -37,6 +38,9 @@ sys.exit(main())
 def call(measure: Callable[..., None], words: Sequence[str]) -> None:
     """Call a function with the values of the words `folder=FOLDER` and `key=value`; default: a temporary folder."""
     given = dict(word.split("=", 1) for word in words)
+    allowed = inspect.signature(measure).parameters
+    if unknown := [key for key in given if key not in allowed]:
+        sys.exit(f"there is no key {unknown[0]!r}, but only {', '.join(allowed)}")
     folder = Path(given.pop("folder", "") or tempfile.mkdtemp()).absolute()
     folder.mkdir(parents=True, exist_ok=True)
     measure(folder, **{name: yaml.safe_load(text) for name, text in given.items()})

@@ -15,6 +15,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import argparse
 from pathlib import Path
 
+from armscan.errors import InvalidValueError
 from benchmarks.sweeps.bench.collect import collect
 from benchmarks.sweeps.bench.ranking import SAMPLERS
 from benchmarks.sweeps.bench.replay import DEFAULT, silence
@@ -52,6 +53,14 @@ def main() -> None:
     starting.add_argument("--studies", type=int, default=20, help="studies (default: 20)")
     starting.add_argument("--pruner", default=DEFAULT.pruner, help=f"pruner of the target (default: {DEFAULT.pruner})")
     given = parser.parse_args()
+    try:
+        _run(given)
+    # A table that is not there, or not fit for the command.
+    except InvalidValueError as error:
+        parser.error(str(error))
+
+
+def _run(given: argparse.Namespace) -> None:
     if given.command == "collect":
         collect(given.sweep, given.configs, given.seeds, given.workers, allow_changes=given.allow_changes)
         return

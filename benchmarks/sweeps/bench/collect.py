@@ -13,6 +13,7 @@ from typing import Any
 import joblib
 import pandas as pd
 
+from armscan.errors import InvalidValueError
 from benchmarks.sweeps.bench.design import Design
 from benchmarks.sweeps.bench.table import (
     METRICS,
@@ -55,7 +56,7 @@ def collect(
     rows = rows.groupby(["config", "seed"]).filter(lambda training: (training.volumes == SELECTION).any())
     earlier = set(rows.fixed_sha256) - {design.fixed_sha256}
     if earlier and not allow_changes:
-        raise ValueError(
+        raise InvalidValueError(
             f"settings of {sweep} that are not searched have changed since {file.name} was begun: give --allow-changes "
             "if they change no training, or take the table away"
         )

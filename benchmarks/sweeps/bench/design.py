@@ -13,6 +13,7 @@ from optuna.distributions import BaseDistribution, CategoricalDistribution, IntD
 from scipy.stats import qmc
 
 from armscan.config.compose import compose, reduce_to_run
+from armscan.errors import InvalidValueError
 from armscan.sweeps.space.parameter import Value, optuna_value
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.tasks.attempt import config_sha256
@@ -50,7 +51,9 @@ class Design:
         config = compose([f"sweep={sweep}", *overrides], return_hydra_config=True)
         space = Space.read(OmegaConf.to_container(config.study.space, resolve=True))
         if conditional := [each.name for each in space.parameters if each.when]:
-            raise ValueError(f"sweep {sweep} searches {conditional[0]} only beside other values, which no bench does")
+            raise InvalidValueError(
+                f"sweep {sweep} searches {conditional[0]} only beside other values, which no bench does"
+            )
         fixed, _ = reduce_to_run(config)
         points = sobol(len(space.parameters), n_configs - 1)
         return cls(sweep, space, (default_of(space, fixed), *(values_at(space, row) for row in points)), _sha256(fixed))

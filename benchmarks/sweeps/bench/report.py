@@ -9,6 +9,7 @@ from typing import Any
 
 import pandas as pd
 
+from armscan.errors import InvalidValueError
 from armscan.utils.text import markdown_table
 from benchmarks.sweeps.bench.importance import Key, keys_of
 from benchmarks.sweeps.bench.picture import draw
@@ -53,6 +54,10 @@ def report(
     _print_keys(keys)
     found = candidates_of(surrogate, sweep, DEFAULT, n_studies=n_studies, n_trainings=n_trainings, top_k=max(TOP_KS))
     control, races = surrogate.config(curves.configs[0]), {}
+    if (least := min(map(len, found))) < max(TOP_KS):
+        raise InvalidValueError(
+            f"a search has {least} finished trials, but {max(TOP_KS)} are raced: give more trainings"
+        )
     for top_k in TOP_KS:
         candidates = [[control, *of_study[:top_k]] for of_study in found]
         fixed = list(choices_of(candidates, FIXED).values())

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from armscan.errors import InvalidValueError
 from armscan.sweeps.space.space import Space
 from armscan.utils.arrays import FloatArray
 from armscan.utils.files import atomic_write
@@ -47,11 +48,11 @@ def write_rows(file: Path, rows: pd.DataFrame) -> None:
 
 
 def check_rows(rows: pd.DataFrame, design: Design) -> None:
-    """Raise `ValueError` if rows have other values than the configurations of a design."""
+    """Raise `InvalidValueError` if rows have other values than the configurations of a design."""
     for number, of_config in rows.groupby("config"):
         for name, value in design.configs[number].items() if number < len(design.configs) else ():
             if name not in rows or (of_config[name] != value).any():
-                raise ValueError(f"the table of {design.sweep} has another {name} in configuration {number}")
+                raise InvalidValueError(f"the table of {design.sweep} has another {name} in configuration {number}")
 
 
 @dataclass(frozen=True)
@@ -92,18 +93,18 @@ class Curves:
         rows = read_rows(file or table_file(sweep))
         collecting = f"python -m benchmarks.sweeps.bench collect {sweep}"
         if rows.empty:
-            raise ValueError(f"there is no table of {sweep} yet: {collecting}")
+            raise InvalidValueError(f"there is no table of {sweep} yet: {collecting}")
         design = Design.of(sweep, int(rows.config.max()) + 1)
         check_rows(rows, design)
         n_seeds = rows[rows.volumes == SELECTION].groupby("config").seed.nunique()
         numbers = n_seeds[n_seeds >= MIN_SEEDS].index
         if numbers.empty:
-            raise ValueError(f"no configuration in the table of {sweep} has {MIN_SEEDS} seeds yet: {collecting}")
+            raise InvalidValueError(f"no configuration in the table of {sweep} has {MIN_SEEDS} seeds yet: {collecting}")
         rows = rows[rows.config.isin(numbers)].sort_values(["config", "seed", "env_steps"])
         epochs, selections, tests = (rows[rows.volumes == volumes] for volumes in (VALIDATION, SELECTION, TEST))
         env_steps = epochs.env_steps.to_numpy(float).reshape(len(tests), -1)
         if (env_steps != env_steps[0]).any():
-            raise ValueError(f"the epochs of the table of {sweep} are not all after the same environment steps")
+            raise InvalidValueError(f"the epochs of the table of {sweep} are not all after the same environment steps")
         return cls(
             sweep,
             design.space,
