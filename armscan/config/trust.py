@@ -197,7 +197,7 @@ def check_artifact_address(uri: str, store: str) -> None:
 
 def _server_of(uri: str) -> tuple[str, str]:
     """Return the scheme of an address, and its server: host and port, without a user; `unknown` if it has no form."""
-    # Clients disagree on the server of `http://one\\@other`.
+    # Clients disagree on the server of `http://one\@other`.
     if not AMBIGUOUS.isdisjoint(uri) or not uri.isprintable():
         return "unknown", "unknown"
     try:

@@ -53,6 +53,7 @@ summary {{ cursor: pointer; font-weight: bold; margin: 1rem 0; }}
 @media print {{
   .table, .chart {{ overflow: visible; }}
   .chart, tr {{ break-inside: avoid; }}
+  h2, h3 {{ break-after: avoid; }}
   .modebar {{ display: none !important; }}
 }}
 @media (max-width: 640px) {{

@@ -131,7 +131,8 @@ def _check_forms_agree(path: Path, pixdim: Sequence[float], forms: Sequence[floa
     cosines = sform[:, :3] / np.linalg.norm(sform[:, :3], axis=0)
     moved = np.linalg.norm(sform[:, 3] - offset) / min(pixdim[1:])
     if np.abs(cosines - turned).max() > COSINE_TOLERANCE:
-        angle_deg = math.degrees(math.acos(min(1.0, (np.sum(cosines * turned, axis=0)).min())))
+        # Rounding may lead beyond -1 and 1.
+        angle_deg = np.degrees(np.arccos(np.clip(np.sum(cosines * turned, axis=0), -1.0, 1.0))).max()
         difference = f"directions, by up to {angle_deg:.3g}°; a cosine may differ by {COSINE_TOLERANCE}"
     elif moved > ORIGIN_TOLERANCE:
         origins = (", ".join(f"{number:g}" for number in each) for each in (offset, sform[:, 3]))

@@ -148,6 +148,7 @@ VOXELS = np.ascontiguousarray(make_tiny_volume().labels[:10, :10, :10].T).tobyte
         (nifti(10, place=float("nan")), "its qform or sform holds a NaN"),
         (nifti(10, place=float("inf")), "its qform or sform holds a NaN"),
         (nifti(10, qform=(0, 0, 0.1, 0, 0, 0)), "qform and sform state different directions, by up to 11.5°"),
+        (nifti(10, qform=(0, 0, 1, 0, 0, 0)), "qform and sform state different directions, by up to 180°"),
         (nifti(10, qform=(0, 0, 0, 0.2, 0, 0)), "origins, (0.2, 0, 0) and (0, 0, 0); they may differ by 0.1 of"),
         (struct.pack("<i", 540) + nifti(10)[4:], "the file is NIfTI-2, but NIfTI-1 is read"),
         (nifti(10, place=1.01), "the spacing is (1, 1, 1) by pixdim, but (1.01, 1, 1) by the sform"),
