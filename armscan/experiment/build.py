@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import inspect
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -15,7 +14,6 @@ from armscan.agents import (
     Agent,
     Compute,
     Learner,
-    PlaneFinder,
     scheduled_algorithms,
 )
 from armscan.config.compose import build_section
@@ -29,7 +27,6 @@ from armscan.tracking import check_settings
 from armscan.training import Budget, CheckpointProvenance, Fingerprints, Split, TrainingDomain
 from armscan.training.domain import smallest_slice, with_crops
 from armscan.training.episode_results import Env
-from armscan.training.subject_splits import PHANTOMS
 from armscan.utils.log import silence_libraries
 from armscan.utils.validation import check_int, check_seed
 from armscan.volumes import LabelVolume
@@ -181,43 +178,6 @@ def check_each_seen(key: str, n_episodes: int, part: str, split: Split) -> None:
     if n_episodes < n_volumes:
         least = f"at least {n_volumes}: one for each {part} volume"
         raise InvalidValueError(f"{key} is {n_episodes}, but it must be {least}")
-
-
-def check_effects(config: DictConfig, overrides: Sequence[str]) -> None:
-    """Check that a new run's settings have an effect.
-
-    Plane finders take no memory, `plane_finder` has its own network, and `data=mixed` validates and tests on volumes of
-    its folder, unless `phantoms` are given.
-
-    Args:
-        config: Configuration of the run.
-        overrides: Its overrides.
-
-    Raises:
-        InvalidValueError: If a setting has no effect.
-    """
-    for part in ("validation", "test"):
-        given = _given(rf"data\.n_{part}", overrides)
-        if given and config.data.get(part, PHANTOMS) != PHANTOMS:
-            raise InvalidValueError(
-                f"{given!r} has no effect: the {part} volumes are those of data.path; give data.{part}={PHANTOMS}"
-            )
-    if not isinstance(algorithm := make_algorithm(config), PlaneFinder):
-        return
-    if config.env.memory:
-        raise InvalidValueError(f"memory is {config.env.memory}, but a plane finder takes no best actions: give 0")
-    if type(algorithm) is not PlaneFinder:
-        return
-    if given := _given("network", overrides):
-        raise InvalidValueError(
-            f"{given!r} has no effect: agent=plane_finder has a network of its own, with agent.filters and "
-            "agent.hidden_sizes"
-        )
-
-
-def _given(key: str, overrides: Sequence[str]) -> str | None:
-    """Return the first override of a key, a regular expression, or of what is below it."""
-    return next((each for each in overrides if re.match(rf"[+~]*{key}[=.]", each)), None)
 
 
 def check_config(config: DictConfig) -> None:

@@ -12,8 +12,9 @@ from omegaconf import DictConfig
 
 from armscan.agents import Learner
 from armscan.config.command_hints import armscan_command, resume_command
-from armscan.experiment.build import RunSetup, check_effects, check_episodes, check_keys, set_up
+from armscan.experiment.build import RunSetup, check_episodes, check_keys, set_up
 from armscan.experiment.console import print_result_table, print_where_to_look
+from armscan.experiment.effects import check_effects, unused_network
 from armscan.experiment.job import Invocation
 from armscan.experiment.provenance import start_tracking
 from armscan.experiment.results import RunResult
@@ -65,6 +66,8 @@ def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict
             with told:
                 setup = set_up(config)
             check_episodes(setup)
+            if unused := unused_network(config, setup.training_env.observation_space, invocation.overrides):
+                print_sentence(f"note: {unused!r} has no effect: network=auto chooses by the observation")
             tracked = start_tracking(config, invocation, setup)
         return run_tracked(setup, tracked, invocation.folder, config.tracking.uri, job_label=job.label if job else None)
 

@@ -58,7 +58,8 @@ def check_grid(arguments: Sequence[str]) -> None:
         return
     print("preparing a grid: checking its overrides", flush=True)
     # Deferred: it takes time, so the line above comes first.
-    from armscan.experiment.build import check_config, check_effects
+    from armscan.experiment.build import check_config
+    from armscan.experiment.effects import check_effects
 
     errors = []
     parsed, jobs = jobs_of(overrides)

@@ -17,7 +17,8 @@ from armscan.config.compose import compose, reduce_to_run
 from armscan.config.defaults import MULTIRUN, NOT_SEARCHED, PLAN, RESUME
 from armscan.config.sources import SWEEP
 from armscan.errors import InvalidValueError
-from armscan.experiment.build import check_config, check_effects
+from armscan.experiment.build import check_config
+from armscan.experiment.effects import check_effects
 from armscan.launch.launchers import LAUNCHER
 
 STUDY = "study"
