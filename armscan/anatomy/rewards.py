@@ -230,7 +230,8 @@ def fitted_reward(
     """Return a reward, or the published one with these targets if it is None, fitted to volumes.
 
     Raises:
-        InvalidValueError: If there are targets beside a reward, or the reward, or what its `fit` returns, is none.
+        InvalidValueError: If targets and a reward are both given, or if the reward, or what its `fit` returns, is not a
+            reward.
     """
     targets = check_targets(targets)
     if reward is None:

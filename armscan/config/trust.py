@@ -27,6 +27,8 @@ SERVER = re.compile(r"(?<![\w+.-])(?!sqlite:)[\w+.-]+://")
 OUTSIDE = re.compile(r"\.\.|(?<![\w-])/")
 # Schemes of artifacts whose clients send no password to a server of anybody's: object stores, a path, a folder.
 OBJECT_STORES = ("s3", "gs", "wasbs")
+# Functions that may write phantoms.
+OF_DATA = tuple(f"armscan.training.{name}_data" for name in ("phantom", "nifti", "mixed"))
 AMBIGUOUS = frozenset("\\ ")
 WITHOUT_PASSWORD = (*OBJECT_STORES, "", "file")
 # Of grids and studies; the configuration of a run names none of their classes.
@@ -57,7 +59,8 @@ def stored_config(config: Mapping[str, Any], *, where: str, trust: bool) -> dict
             user's own cache is used.
 
     Raises:
-        UntrustedError: If it names a class that armscan does not offer, or holds an interpolation.
+        UntrustedError: If it names a class that armscan does not offer, holds an interpolation, or could write phantoms
+            into a folder that it names.
     """
     config = migrate(config)
     if trust:
@@ -75,12 +78,12 @@ def _misplaced_part(config: Mapping[str, Any]) -> str | None:
     Only `data` makes volumes, and by named arguments.
     """
     for key, value in _leaves(config):
-        *_, name = parts = key.split(".")
+        parts = key.split(".")
         if "_args_" in parts:
             return f"has {key}, but armscan's classes are given arguments by name"
-        is_of_data = name == "cache_dir" or (name == TARGET and str(value).endswith("_data"))
-        if is_of_data and parts != ["data", name]:
-            return f"has {key}={value!r}, but only data makes volumes"
+        is_of_data = parts[-1] == "cache_dir" or (parts[-1] == TARGET and value in OF_DATA)
+        if is_of_data and parts[:-1] != ["data"]:
+            return f"has {key}={value!r}, but this is allowed only in the section data"
     return None
 
 
@@ -197,8 +200,9 @@ def check_artifact_address(uri: str, store: str) -> None:
 
 def _server_of(uri: str) -> tuple[str, str]:
     """Return the scheme of an address, and its server: host and port, without a user; `unknown` if it has no form."""
+    authority = re.split("[/?#]", uri.partition("://")[2], maxsplit=1)[0]
     # Clients disagree on the server of `http://one\@other`.
-    if not AMBIGUOUS.isdisjoint(uri) or not uri.isprintable():
+    if not AMBIGUOUS.isdisjoint(authority) or not uri.isprintable():
         return "unknown", "unknown"
     try:
         parts = urlsplit(uri)

@@ -15,6 +15,7 @@ from armscan.envs.observations import (
     Observation,
     SliceGeometry,
     View,
+    check_mapping,
     observe_all,
 )
 from armscan.envs.slice_observations import SliceChannelsObservation, SliceObservation
@@ -39,6 +40,7 @@ class MergedObservation:
     def __init__(self, observations: Sequence[ObservationLike], *, targets: Sequence[int] = PUBLISHED_TARGETS) -> None:
         if isinstance(observations, str) or not isinstance(observations, Sequence) or not observations:
             raise InvalidValueError(f"observations is {observations!r}, but it must be a list of at least one")
+        # Filled by `spaces`, before which nothing is checked.
         self._boxes: dict[str, spaces.Box] = {}
         checked = [_observation(observation, targets) for observation in observations]
         self.observations: tuple[Observation, ...] = tuple(
@@ -80,18 +82,18 @@ class MergedObservation:
         """Return the parts of an observation; those of a user's own must lie in their spaces."""
         if type(observation) in OURS:
             return parts
-        name = type(observation).__name__
-        if not isinstance(parts, Mapping):
-            raise InvalidValueError(f"{name}.observe returned {parts!r}, but it must return an array for each part")
+        check_mapping(observation, parts)
         for key, part in parts.items():
             box, values = self._boxes.get(key), np.asarray(part)
             # Missing parts and wrong shapes are reported when the observation is put together.
             if box is None or values.shape[values.ndim - len(box.shape) :] != box.shape:
                 continue
-            is_whole = np.issubdtype(box.dtype, np.floating) or np.issubdtype(values.dtype, np.integer)
+            has_fitting_dtype = np.issubdtype(box.dtype, np.floating) or np.issubdtype(values.dtype, np.integer)
             # A NaN is not within any bounds.
-            if not is_whole or not ((box.low <= values) & (values <= box.high)).all():
-                raise InvalidValueError(f"{name}.observe gave {values!r} as {key}, but its space is {box}")
+            if not has_fitting_dtype or not ((box.low <= values) & (values <= box.high)).all():
+                raise InvalidValueError(
+                    f"{type(observation).__name__}.observe gave {values!r} as {key}, but its space is {box}"
+                )
         return parts
 
 

@@ -84,10 +84,16 @@ def observe_all(observation: Observation, views: Sequence[View]) -> Parts:
         parts: Parts = observe_them(views)
         return parts
     observed = [observation.observe(view) for view in views]
-    if not all(isinstance(parts, Mapping) for parts in observed):
-        name = type(observation).__name__
-        raise InvalidValueError(f"{name}.observe returned {observed!r}, but it must return an array for each part")
+    for parts in observed:
+        check_mapping(observation, parts)
     return {name: np.stack([parts[name] for parts in observed]) for name in observed[0]}
+
+
+def check_mapping(observation: Observation, parts: object) -> None:
+    """Raise `InvalidValueError` if what an observation returned is no mapping."""
+    if not isinstance(parts, Mapping):
+        name = type(observation).__name__
+        raise InvalidValueError(f"{name}.observe returned {parts!r}, but it must return an array for each part")
 
 
 class ActionRewardObservation:

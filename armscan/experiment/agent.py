@@ -60,7 +60,7 @@ def make_agent(
         make_validation_envs=None if validation is None else _vector_envs(env_factory.undeformed(), validation),
     )
     agent = algorithm.agent(setup)
-    _check_agent(agent)
+    _check_agent(agent, algorithm)
     # All of them now, so that errors come before anything is trained.
     later: list[tuple[int, Any]] = [
         (start, each.agent(setup)) for start, each in scheduled_algorithms(algorithm, schedule)
@@ -73,10 +73,13 @@ def _vector_envs(env_factory: EnvFactory, volumes: Mapping[str, LabelVolume]) ->
     return partial(env_factory.make_vector_env, volumes=dict(volumes))
 
 
-def _check_agent(agent: Agent) -> None:
+def _check_agent(agent: Agent, algorithm: Algorithm) -> None:
     """Raise `InvalidValueError` if an agent lacks methods of `Agent`, or learns, but lacks those of `Learner`."""
     if not all(callable(getattr(agent, name, None)) for name in ("begin", "act")):
-        raise InvalidValueError(f"the algorithm made {agent!r}, but it must make an object with the methods of Agent")
+        raise InvalidValueError(
+            f"{type(algorithm).__name__}.agent returned {agent!r}, but it must return an object with the methods "
+            "begin and act"
+        )
     if hasattr(agent, "learn") and not isinstance(agent, Learner):
         missing = [name for name in dir(Learner) if not name.startswith("_") and not hasattr(agent, name)]
         raise InvalidValueError(

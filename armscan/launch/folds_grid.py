@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
@@ -44,16 +45,9 @@ def with_folds(arguments: Sequence[str]) -> list[str]:
         return list(arguments)
     if any(each.key_or_group == FOLDS and each.is_sweep_override() for each in parsed):
         raise InvalidValueError(f"{FOLDS} has several values, but all jobs of a grid share one: start a grid for each")
-    wanted = {tuple(each.get(key) for key in ("folds", "path", "n_volumes")) for each in data_of_jobs}
-    if all(folds is None for folds, *_ in wanted):
+    if all(each.get("folds") is None for each in data_of_jobs):
         return list(arguments)
-    if len(wanted) > 1:
-        of_jobs = listed(sorted({str(folds) for folds, *_ in wanted}))
-        raise InvalidValueError(
-            f"the jobs of this grid differ in {FOLDS} ({of_jobs}) or in their volumes, but all jobs of a grid share "
-            "their folds: start a grid for each"
-        )
-    ((folds, path, n_volumes),) = wanted
+    folds, path, n_volumes = (_shared(key, data_of_jobs) for key in ("folds", "path", "n_volumes"))
     # Deferred: command-line errors are reported before these are loaded.
     from armscan.training.subject_splits import check_folds, n_folds
     from armscan.volumes.dataset import subjects_in
@@ -66,8 +60,19 @@ def with_folds(arguments: Sequence[str]) -> list[str]:
     return [MULTIRUN[0], *overrides, f"{FOLD}={','.join(map(str, range(count)))}"]
 
 
+def _shared(key: str, data_of_jobs: Sequence[DictConfig]) -> Any:
+    """Return the value of a key of `data` that all jobs share; raise `InvalidValueError` if they do not."""
+    values = {each.get(key) for each in data_of_jobs}
+    if len(values) > 1:
+        raise InvalidValueError(
+            f"data.{key} differs between the jobs of this grid ({listed(sorted(map(str, values)))}), but folds are of "
+            "the same volumes in all of them: start a grid for each"
+        )
+    return values.pop()
+
+
 def _data_of_jobs(parsed: Sequence[Override]) -> list[DictConfig]:
-    """Return the sections `data` of a grid's jobs, each once; only choices of groups may vary them."""
+    """Return the section `data` of each combination of experiment and data; other varied overrides are left out."""
     setting = [
         each for each in parsed if each.input_line and (each.key_or_group in GROUPS or not each.is_sweep_override())
     ]

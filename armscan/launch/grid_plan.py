@@ -38,12 +38,13 @@ def print_grid_plan(arguments: Sequence[str]) -> None:
             f"{PLAN} is given, but this is a single run: it shows the jobs of a grid, and what a study searches "
             f"({SWEEP}=NAME)"
         )
-    fixed = _check_fixed(parsed)
+    _check_shared(parsed)
+    shared = _shared(parsed)
     print(f"a grid of {len(jobs)} jobs")
     for number, job in enumerate(jobs):
         # Raises the error that the job would.
         compose(job)
-        print(f"{number:4d}  {' '.join(each for each in job if each not in fixed)}")
+        print(f"{number:4d}  {' '.join(each for each in job if each not in shared)}")
 
 
 def check_grid(arguments: Sequence[str]) -> None:
@@ -63,7 +64,7 @@ def check_grid(arguments: Sequence[str]) -> None:
 
     errors = []
     parsed, jobs = jobs_of(overrides)
-    _check_fixed(parsed)
+    _check_shared(parsed)
     for job in jobs:
         config = compose(job)
         try:
@@ -76,17 +77,19 @@ def check_grid(arguments: Sequence[str]) -> None:
     raise errors[0]
 
 
-def _check_fixed(parsed: Sequence[Override]) -> list[str]:
-    """Return the overrides that all jobs share; raise an error if these alone, which Hydra composes, are wrong."""
-    fixed = [str(each.input_line) for each in parsed if not each.is_sweep_override()]
+def _check_shared(parsed: Sequence[Override]) -> None:
+    """Raise an error if Hydra cannot compose the overrides that all jobs share, which it does first."""
     try:
-        compose(fixed)
+        compose(_shared(parsed))
     except (HydraException, OmegaConfBaseException) as error:
         varied = [each.key_or_group for each in parsed if each.is_sweep_override() and each.key_or_group in GROUPS]
         if not varied:
             raise
         raise InvalidValueError(
-            f"{one_line_message(error)}; Hydra first composes a grid without {varied[0]}, which has several values: "
-            "choose the data of the others, too, for instance by data=mixed"
+            f"{one_line_message(error)}; Hydra first composes the grid without {varied[0]}, because it has several "
+            "values: add what the other overrides need, such as data=mixed"
         ) from error
-    return fixed
+
+
+def _shared(parsed: Sequence[Override]) -> list[str]:
+    return [str(each.input_line) for each in parsed if not each.is_sweep_override()]

@@ -57,11 +57,10 @@ def keep_tables(
             print_result_table(f"{next(iter(of_folds.results)).split(', ')[1]} (test)", of_folds, notes)
             keep_folds_table(of_folds, table, folder, store, parent["run_id"], notes)
         else:
-            notes = (
-                [] if n_finished == n_jobs else [f"{n_jobs - n_finished} of {counted(n_jobs, 'job')} have no result"]
-            )
-            for note in notes:
-                print(f"note: {note}")
+            notes = []
+            if n_finished < n_jobs:
+                notes.append(f"of {n_jobs} jobs, {n_jobs - n_finished} without a result")
+                print(f"note: {notes[0]}")
             body = f"<p><code>{html.escape(' '.join(parent['overrides']))}</code></p>{table.html()}"
             text = page(f"Grid of {counted(n_jobs, 'job')}", body, notes=notes)
             _keep_page(folder, text, "\n\n".join([*notes, table.markdown()]), store, parent["run_id"])

@@ -78,7 +78,7 @@ def _reports(run: FoundRun, folder: Path) -> dict[str, EvaluationReport]:
     reports = {}
     if EVALUATION_FILE in run.files:
         reports["at the end of the run"] = _read(run, run.run_id, EVALUATION_FILE, folder)
-    is_own = bool(reports)
+    has_own = bool(reports)
     for position, (run_id, file) in enumerate(_evaluated(run)):
         report = _read(run, run_id, file, folder)
         changes = report.facts["changes"]
@@ -86,7 +86,7 @@ def _reports(run: FoundRun, folder: Path) -> dict[str, EvaluationReport]:
         if position == 0 or not changes:
             title = f"by evaluation {run_id}, on {report.facts['data']}"
             reports[", ".join([title, *assigned(changes)])] = report
-        if is_own or not changes:
+        if has_own or not changes:
             break
     return reports
 

@@ -133,14 +133,12 @@ def _check_forms_agree(path: Path, pixdim: Sequence[float], forms: Sequence[floa
     if np.abs(cosines - turned).max() > COSINE_TOLERANCE:
         # Rounding may lead beyond -1 and 1.
         angle_deg = np.degrees(np.arccos(np.clip(np.sum(cosines * turned, axis=0), -1.0, 1.0))).max()
-        difference = f"directions, by up to {angle_deg:.3g}°; a cosine may differ by {COSINE_TOLERANCE}"
+        stated = f"directions that differ by up to {angle_deg:.3g}° (each cosine may differ by {COSINE_TOLERANCE})"
     elif moved > ORIGIN_TOLERANCE:
         origins = (", ".join(f"{number:g}" for number in each) for each in (offset, sform[:, 3]))
-        difference = (
-            f"origins, ({') and ('.join(origins)}); they may differ by {ORIGIN_TOLERANCE} of the smallest spacing"
+        stated = (
+            f"the origins ({') and ('.join(origins)}), which may differ by {ORIGIN_TOLERANCE} of the smallest spacing"
         )
     else:
         return
-    raise VolumeError(
-        f"{path}: qform and sform state different {difference}: copy the right one over the other, as with fslorient"
-    )
+    raise VolumeError(f"{path}: qform and sform state {stated}: copy the right one over the other, as with fslorient")

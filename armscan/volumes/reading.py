@@ -126,7 +126,7 @@ def read_stored(
 
 
 def _states_directions(path: Path) -> bool:
-    return states_directions(path) if path.name.endswith((".nii", ".nii.gz")) else True
+    return not path.name.endswith((".nii", ".nii.gz")) or states_directions(path)
 
 
 def _read_labels(path: Path, options: ReadingOptions) -> tuple[SimpleITK.Image, tuple[FoundSource, ...]]:

@@ -160,7 +160,7 @@ def gradient_steps_per_s(case: str) -> float:
     name, device, seconds = case.split("; ")
     if (name, device) not in _UPDATERS:
         torch.set_num_threads(1)
-        _UPDATERS[name, device] = updates.updater(*updates.CASES[name], Compute(device), is_tianshous=False)
+        _UPDATERS[name, device] = updates.updater(*updates.CASES[name], Compute(device), by_tianshou=False)
     return _UPDATERS[name, device](float(seconds))
 
 

@@ -51,7 +51,7 @@ WORDS = (
     "study.workers=1",
     "study/pruner=none",
     "study.final_eval.top_k=0",
-    # Of all checkouts; that of today has other numbers, and begins with a preset.
+    # The same for every checkout: today's `sac_y` has other numbers of volumes, and enqueues a preset.
     "data.n_validation=4",
     "data.n_test=8",
 )

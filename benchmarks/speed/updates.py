@@ -55,13 +55,13 @@ def ways() -> dict[str, Compute]:
     }
 
 
-def updater(env_factory: EnvFactory, network: Network, compute: Compute, *, is_tianshous: bool):
+def updater(env_factory: EnvFactory, network: Network, compute: Compute, *, by_tianshou: bool):
     """Return a function that measures updates per second, Tianshou's or the agent's, with a filled replay buffer."""
     setup = agent_setup(env_factory, load_phantoms(range(2)), 10 * N_RANDOM_STEPS, compute)
     learner = SAC(network=network, learning_starts=N_RANDOM_STEPS).agent(setup)
     learner.warm_up()
     algorithm, replay = learner._algorithm, learner._replay
-    update = partial(sac.SAC.update, algorithm) if is_tianshous else algorithm.update
+    update = partial(sac.SAC.update, algorithm) if by_tianshou else algorithm.update
 
     def measure(seconds: float = ROUND_S) -> float:
         n_updates, start_s = 0, time.perf_counter()
@@ -85,7 +85,7 @@ def main(words: list[str]) -> None:
         sys.exit(f"{' '.join(words)} is part of no name: {', '.join(CASES)}")
     print_head("observation, network", "computed", "updates/s, median", "best", "beside the first")
     for name, (env_factory, network) in chosen.items():
-        measures = {way: updater(env_factory, network, compute, is_tianshous=True) for way, compute in ways().items()}
+        measures = {way: updater(env_factory, network, compute, by_tianshou=True) for way, compute in ways().items()}
         for measure in measures.values():
             # Compiles.
             measure(0.0)

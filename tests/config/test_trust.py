@@ -72,7 +72,7 @@ def test_stored_configuration_writes_phantoms_into_no_folder(changes):
     config = OmegaConf.create(default_config())
     for key, value in changes.items():
         OmegaConf.update(config, key, value, force_add=True)
-    with pytest.raises(UntrustedError, match=r"run 1: its configuration has .*_args_|only data makes volumes"):
+    with pytest.raises(UntrustedError, match=r"run 1: its configuration has .*_args_|only in the section data"):
         stored_config(to_plain(config), where="run 1", trust=False)
     assert stored_config(default_config(), where="run 1", trust=False)["data"]["cache_dir"] is None
 
@@ -185,11 +185,13 @@ def test_password_is_sent_to_no_server_that_a_folder_names(uri):
 def test_password_is_sent_to_no_server_that_a_run_names_for_its_artifacts(uri, store):
     with pytest.raises(UntrustedError, match=re.escape(f"the artifacts are in {printable(uri)}, but ")):
         check_artifact_address(uri, store)
-    for own in ("/a", "file:///a", "s3://bucket/a"):
+    for own in ("/a", "/my folder/a", "file:///a", "s3://bucket/a", "s3://bucket/my folder/a"):
         check_artifact_address(own, store)
 
 
-@pytest.mark.parametrize("uri", ["mlflow-artifacts:/0/a", f"{STORE}/api/2.0/mlflow-artifacts/artifacts/0/a"])
+@pytest.mark.parametrize(
+    "uri", ["mlflow-artifacts:/0/a", "mlflow-artifacts:/0/a b", f"{STORE}/api/2.0/mlflow-artifacts/artifacts/0/a"]
+)
 def test_artifacts_may_be_on_the_server_of_their_store_alone(uri):
     for store in (STORE, STORE.replace("http://", "http://me@")):
         check_artifact_address(uri, store)

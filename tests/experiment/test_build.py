@@ -101,5 +101,5 @@ def test_section_that_builds_something_else_is_refused(phantom, monkeypatch, sec
 def test_algorithm_that_makes_no_agent_is_refused(phantom, monkeypatch, made):
     config = config_of_sizes(phantom, monkeypatch, "agent=random")
     monkeypatch.setattr("armscan.agents.Random.agent", lambda *_: made)
-    with pytest.raises(InvalidValueError, match=r"the algorithm made .*, but it must make an object with the methods"):
+    with pytest.raises(InvalidValueError, match=r"Random.agent returned .*, but it must return an object with"):
         build_setup(config)

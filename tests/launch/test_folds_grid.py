@@ -84,13 +84,13 @@ def test_several_experiments_may_ask_for_the_same_folds(folder):
     words = ["data=mixed", f"data.path={folder}"]
     several = ["experiment=few_wrists,few_wrists_sac", *words]
     assert with_folds(["-m", *several]) == ["-m", *several, "data.fold=0,1"]
-    with pytest.raises(InvalidValueError, match=r"differ in data.folds \(None or leave_one_out\) or in their volumes"):
+    with pytest.raises(InvalidValueError, match=r"data.folds differs between the jobs .* \(None or leave_one_out\)"):
         with_folds(["-m", "experiment=few_wrists,best_y", *words])
 
 
 def test_plan_refuses_what_hydra_cannot_compose_without_the_varied_keys(folder):
     with pytest.raises(
-        InvalidValueError, match=r"needs data=nifti .*; Hydra first composes a grid without experiment,"
+        InvalidValueError, match=r"needs data=nifti .*; Hydra first composes the grid without experiment,"
     ):
         print_grid_plan(["-m", "experiment=few_wrists,few_wrists_sac", f"data.path={folder}", "--plan"])
 
@@ -227,11 +227,11 @@ def test_page_of_an_interrupted_grid_counts_the_jobs_that_were_planned(tmp_path,
     outcomes = {"0": JobOutcome("", f"{key}=0", metrics={}), "1": JobOutcome("", f"{key}=1", failure="interrupted")}
     parent = {"overrides": [f"{key}=0,1,2,3"], "common": [], "run_id": run_id, "has_known_jobs": True}
     keep_tables(jobs_table(outcomes, {}, have_same_task=False), tmp_path, parent, outcomes, [], store)
-    assert capsys.readouterr() == ("note: 3 of 4 jobs have no result\n", "")
+    assert capsys.readouterr() == ("note: of 4 jobs, 3 without a result\n", "")
     page = (tmp_path / RESULTS_PAGE).read_text()
     assert "<h1>Grid of 4 jobs</h1>" in page
-    assert "<p>3 of 4 jobs have no result</p>" in page
-    assert store.get_run(run_id).data.tags[DESCRIPTION_TAG].startswith("3 of 4 jobs have no result\n\n")
+    assert "<p>of 4 jobs, 3 without a result</p>" in page
+    assert store.get_run(run_id).data.tags[DESCRIPTION_TAG].startswith("of 4 jobs, 3 without a result\n\n")
 
 
 @pytest.mark.parametrize(

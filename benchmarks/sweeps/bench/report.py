@@ -56,7 +56,7 @@ def report(
     control, races = surrogate.config(curves.configs[0]), {}
     if (least := min(map(len, found))) < max(TOP_KS):
         raise InvalidValueError(
-            f"a search has {least} finished trials, but {max(TOP_KS)} are raced: give more trainings"
+            f"a search has {least} finished trials, but {max(TOP_KS)} are raced: give a larger --trainings"
         )
     for top_k in TOP_KS:
         candidates = [[control, *of_study[:top_k]] for of_study in found]
