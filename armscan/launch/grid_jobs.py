@@ -18,3 +18,10 @@ def jobs_of(overrides: Sequence[str]) -> tuple[list[Override], list[list[str]]]:
         parsed = OverridesParser.create(config_loader=loader).parse_overrides(list(overrides))
         (jobs,) = BasicSweeper.split_arguments(parsed, max_batch_size=None)
     return parsed, jobs
+
+
+def shared_overrides(parsed: Sequence[Override]) -> list[str]:
+    """Return the overrides that all jobs share, as Hydra spells them for each job: `agent.lr=0.001` for `1e-3`."""
+    # The last override of a key counts.
+    by_key = {each.get_key_element(): each for each in parsed}
+    return [f"{key}={each.get_value_element_as_str()}" for key, each in by_key.items() if not each.is_sweep_override()]

@@ -14,7 +14,7 @@ from armscan.config.error_messages import one_line_message
 from armscan.config.sources import SWEEP
 from armscan.errors import ArmscanError, InvalidValueError
 from armscan.launch.folds_grid import GROUPS, with_folds
-from armscan.launch.grid_jobs import jobs_of
+from armscan.launch.grid_jobs import jobs_of, shared_overrides
 
 # With these arguments, only Hydra knows the jobs.
 NOT_CHECKED = ("-", "hydra/sweeper", "hydra.sweeper")
@@ -39,7 +39,7 @@ def print_grid_plan(arguments: Sequence[str]) -> None:
             f"({SWEEP}=NAME)"
         )
     _check_shared(parsed)
-    shared = _shared(parsed)
+    shared = shared_overrides(parsed)
     print(f"a grid of {len(jobs)} jobs")
     for number, job in enumerate(jobs):
         # Raises the error that the job would.
@@ -80,7 +80,7 @@ def check_grid(arguments: Sequence[str]) -> None:
 def _check_shared(parsed: Sequence[Override]) -> None:
     """Raise an error if Hydra cannot compose the overrides that all jobs share, which it does first."""
     try:
-        compose(_shared(parsed))
+        compose([str(each.input_line) for each in parsed if not each.is_sweep_override()])
     except (HydraException, OmegaConfBaseException) as error:
         varied = [each.key_or_group for each in parsed if each.is_sweep_override() and each.key_or_group in GROUPS]
         if not varied:
@@ -89,7 +89,3 @@ def _check_shared(parsed: Sequence[Override]) -> None:
             f"{one_line_message(error)}; Hydra first composes the grid without {varied[0]}, because it has several "
             "values: add what the other overrides need, such as data=mixed"
         ) from error
-
-
-def _shared(parsed: Sequence[Override]) -> list[str]:
-    return [str(each.input_line) for each in parsed if not each.is_sweep_override()]

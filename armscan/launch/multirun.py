@@ -30,6 +30,7 @@ from armscan.experiment.job import (
     JobOutcome,
     remove_run_folder,
 )
+from armscan.launch.grid_jobs import shared_overrides
 from armscan.launch.launchers import LAUNCHER, ON_THIS_MACHINE, check_launcher, prepare_launcher
 from armscan.tracking import TrackingStore, begin_outbox, code_state, note_end, open_store, sync
 from armscan.tracking.sync import PROCESS_DIED
@@ -106,7 +107,8 @@ class Multirun(Callback):
         run = client.create_run(experiment_id, name=f"grid {command}"[:250], tags=tags)
         if Multirun.repeats is not None:
             client.set_tag(Multirun.repeats, CONTINUED_TAG, run.info.run_id)
-        parent = {"run_id": run.info.run_id, "tracking": tracking, "overrides": overrides, "common": _common(overrides)}
+        parent = {"run_id": run.info.run_id, "tracking": tracking, "overrides": overrides}
+        parent |= {"common": shared_overrides(OverridesParser.create().parse_overrides([*overrides]))}
         parent |= {"repeats": Multirun.repeats, "is_trusted": Multirun.is_trusted}
         # Only of Hydra's own sweeper, the jobs are known.
         parent |= {"has_known_jobs": config.hydra.runtime.choices["hydra/sweeper"] == "basic"}
@@ -117,13 +119,6 @@ class Multirun(Callback):
         (folder / PARENT_FILE).write_text(json.dumps(parent))
         Multirun.folder, Multirun.outbox = folder, begin_outbox(folder, run.info.run_id, tracking["uri"])
         Multirun.launcher = launcher
-
-
-def _common(overrides: Sequence[str]) -> list[str]:
-    """Return the overrides that all jobs share, as Hydra spells them for each job: `agent.lr=0.001` for `1e-3`."""
-    # The last override of a key counts.
-    by_key = {each.get_key_element(): each for each in OverridesParser.create().parse_overrides([*overrides])}
-    return [f"{key}={each.get_value_element_as_str()}" for key, each in by_key.items() if not each.is_sweep_override()]
 
 
 @contextmanager

@@ -52,7 +52,7 @@ def test_plan_lists_the_folds_beside_what_else_a_grid_varies(folder, capsys):
 
 
 def test_plan_knows_which_choices_a_pattern_has(capsys):
-    print_grid_plan(["-m", "agent=glob(ran*)", "seed=0,1", "--plan"])
+    print_grid_plan(["-m", "agent=glob(ran*)", "seed=0,1", "training.env_steps=2e4", "--plan"])
     assert [line.split()[1:] for line in capsys.readouterr().out.splitlines()[1:]] == [
         ["agent=random", "seed=0"],
         ["agent=random", "seed=1"],

@@ -14,7 +14,8 @@ from armscan import run
 from armscan.config.error_messages import one_line_message
 from armscan.errors import ArmscanError
 from armscan.experiment.job import INTERRUPTED, OUTCOME_FOLDER, PARENT_FILE, JobOutcome
-from armscan.launch.multirun import Multirun, _common, end_grid
+from armscan.launch.grid_jobs import shared_overrides
+from armscan.launch.multirun import Multirun, end_grid
 from armscan.tracking import begin_outbox, sync
 from armscan.tracking.tags import FOLDER_TAG, JOB_TAG, PARENT_TAG
 from armscan.utils.processes import ProcessInfo
@@ -91,7 +92,7 @@ def test_override_of_all_jobs_is_recognised_however_hydra_spells_it():
     words = ["agent.lr=1e-3", "env.transform={rx_deg: 1.0}", "stack_memory=false", "data.path='a b'", "seed=1"]
     words += ["~data.folds", "+x=[1, 2]", "seed=3,4"]
     ((first, second),) = BasicSweeper.split_arguments(OverridesParser.create().parse_overrides(words), None)
-    common = _common(words)
+    common = shared_overrides(OverridesParser.create().parse_overrides(words))
     assert [[word for word in job if word not in common] for job in (first, second)] == [["seed=3"], ["seed=4"]]
 
 
