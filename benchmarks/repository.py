@@ -3,17 +3,11 @@
 from __future__ import annotations
 
 import os
-import sys
 from pathlib import Path
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 PICTURES = REPOSITORY / "docs" / "images"
 VOLUMES = REPOSITORY / "tests" / "data" / "volumes"
-
-
-def given_volumes() -> Path:
-    """Return the folder of volumes that is the script's only argument; without one, that of the tests."""
-    return Path(sys.argv[1]) if len(sys.argv) > 1 else VOLUMES
 
 
 def environment(python_path: Path | str = REPOSITORY, **variables: str) -> dict[str, str]:

@@ -11,7 +11,6 @@ can do, not possible for unseen wrists.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 
 import numpy as np
@@ -20,6 +19,7 @@ from armscan.anatomy import AgreementReward, LandmarkReward, Reward, TissueClust
 from armscan.training.splits import mixed_data
 from armscan.volumes import LabelVolume, ManipulatorAction
 from armscan.volumes.plane import plane_distance
+from benchmarks.arguments import parser_of
 from benchmarks.tables import print_head, print_row
 
 N_PLANES, OFFSET_MM, ANGLE_DEG = 1000, 10.0, 20.0
@@ -55,8 +55,11 @@ def distances_of_accepted(
     return distances
 
 
-def main(folder: str) -> None:
+def main() -> None:
     """Print the table."""
+    parser = parser_of(__doc__)
+    parser.add_argument("folder", help="labelmaps to fit the rewards to, beside phantoms")
+    folder = parser.parse_args().folder
     split = mixed_data(folder, n_training=64, n_validation=1, n_test=12)
     fitted = AgreementReward().fit(split.training.values())
     tight = AgreementReward(slack=0.0, slack_mm=0.0).fit(split.training.values())
@@ -79,4 +82,4 @@ def main(folder: str) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main()

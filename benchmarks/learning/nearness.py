@@ -14,7 +14,6 @@ step.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -28,6 +27,7 @@ from armscan.tracking.tags import AGENT_TAG
 from armscan.training import TEST, evaluate
 from armscan.training.episode_results import EpisodeResult
 from armscan.training.episode_seeds import EVALUATION_SEED
+from benchmarks.arguments import count, parser_of
 from benchmarks.tables import print_head, print_row
 
 N_PHANTOMS, N_GROUPS = 12, 10
@@ -81,11 +81,11 @@ def print_expected_errors(episodes: Sequence[EpisodeResult]) -> None:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("run")
     parser.add_argument("data", nargs="?")
     parser.add_argument("--tracking", default=default_tracking()["uri"])
-    parser.add_argument("--episodes", type=int, default=300)
+    parser.add_argument("--episodes", type=count, default=300)
     parser.add_argument("--rx", type=float)
     parser.add_argument("--averaged", type=int)
     given = parser.parse_args()

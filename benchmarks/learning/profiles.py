@@ -10,7 +10,6 @@ is; in depth, palmar.
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections.abc import Iterable
 from dataclasses import replace
@@ -21,6 +20,7 @@ from armscan.anatomy import TissueClusters
 from armscan.training.splits import TEST_FIRST_SEED
 from armscan.volumes import LabelVolume, make_phantom, read_dataset
 from armscan.volumes.phantom import VERSIONS
+from benchmarks.arguments import count, parser_of
 from benchmarks.tables import print_head, print_row
 
 PLACES_MM = np.arange(-40, 46)
@@ -115,9 +115,9 @@ def ranges(volumes: Iterable[LabelVolume]) -> dict[str, np.ndarray]:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("data")
-    parser.add_argument("--phantoms", type=int, default=64)
+    parser.add_argument("--phantoms", type=count, default=64)
     given = parser.parse_args()
     ours = ranges(read_dataset(given.data).values())
     seeds = range(TEST_FIRST_SEED, TEST_FIRST_SEED + given.phantoms)

@@ -1,9 +1,9 @@
 """Repeat the published experiments, and draw their learning curves over the published ones.
 
-    python -m benchmarks.learning.published [small|full] [folder=RUNS] [data=VOLUMES] [NAME ...]
+    python -m benchmarks.learning.published [--full] [--folder RUNS] [--data VOLUMES] [NAME ...]
 
-`small` (default) stops each training after a few minutes; `full` takes the environment steps of the preset, hours for
-two degrees of freedom. NAMEs of presets, such as `published_sac_y_8`, run only these. Given a folder of volumes, runs
+Each training stops after a few minutes; with `--full`, it takes the environment steps of the preset, hours for two
+degrees of freedom. NAMEs of presets, such as `published_sac_y_8`, run only these. Given a folder of volumes, runs
 train on its first 1, 2 or 8, otherwise on as many phantoms. A run that has finished in the folder of runs is not
 repeated.
 
@@ -16,7 +16,6 @@ clock starts at its first point.
 from __future__ import annotations
 
 import csv
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,7 +24,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from benchmarks.learning.runs import MIXED, chosen_words, finished_run, runs_folder
+from benchmarks.arguments import parser_of
+from benchmarks.learning.runs import MIXED, add_folder, finished_run
 from benchmarks.repository import PICTURES
 from benchmarks.tables import print_head, print_row
 
@@ -196,12 +196,18 @@ def _reached(when: tuple[int, float] | None) -> str:
     return f"{steps:,} steps, {time}"
 
 
-def main(words: list[str]) -> None:
-    """Run, draw and print what the words ask for."""
-    usage = f"see the text at the head of {__file__}"
-    chosen, given = chosen_words(words, ("small", "full", *EXPERIMENTS), {"folder", "data"}, usage)
-    names, folder = [word for word in chosen if word in EXPERIMENTS] or list(EXPERIMENTS), runs_folder(given)
-    found = {name: curves(name, is_full="full" in words, volumes=given.get("data"), folder=folder) for name in names}
+def main() -> None:
+    """Run, draw and print the chosen experiments."""
+    parser = parser_of(__doc__)
+    parser.add_argument("names", nargs="*", metavar="NAME", help="preset (default: all)")
+    parser.add_argument("--full", action="store_true", help="take all environment steps of the preset")
+    parser.add_argument("--data", help="folder of volumes (default: phantoms)")
+    add_folder(parser)
+    given = parser.parse_args()
+    if unknown := [name for name in given.names if name not in EXPERIMENTS]:
+        parser.error(f"{unknown[0]!r} is none of {', '.join(EXPERIMENTS)}")
+    names, folder = given.names or list(EXPERIMENTS), given.folder
+    found = {name: curves(name, is_full=given.full, volumes=given.data, folder=folder) for name in names}
     picture = (PICTURES if len(names) == len(EXPERIMENTS) else folder) / "published.png"
     draw(found, picture)
     print_table(found)
@@ -209,4 +215,4 @@ def main(words: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

@@ -1,20 +1,18 @@
 """Evaluate trained agents and baselines on unseen wrists.
 
-    python -m benchmarks.learning.results data=VOLUMES [folder=RUNS] [seeds=0,1,2] [workers=2] [ROW ...]
-    python -m benchmarks.learning.results show
+    python -m benchmarks.learning.results [--data VOLUMES] [--folder RUNS] [--seeds 0 1 2] [--workers 2] [ROW ...]
 
 A row is a preset (`conf/experiment`) or a baseline. Its training volumes are phantoms and all volumes of the folder; it
 is run once for each seed, and judged in 300 episodes on 12 phantoms that it was not trained on, which are moved at each
-reset, with 50 steps at most. The named rows (default: all) are run, `workers` at a time, unless they have finished in
-the folder of runs. Their figures are kept in `results.json` beside this script, and the table is printed. `show` only
-prints it.
+reset, with 50 steps at most. The named rows (default: all) are run, `--workers` at a time, unless they have finished in
+the folder of runs. Their figures are kept in `results.json` beside this script, and their table is printed. Without
+`--data`, it is only printed.
 """
 
 from __future__ import annotations
 
 import json
 import statistics
-import sys
 from collections.abc import Collection
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -22,7 +20,8 @@ from pathlib import Path
 
 from filelock import FileLock
 
-from benchmarks.learning.runs import MIXED, Run, chosen_words, finished_run, runs_folder
+from benchmarks.arguments import count, parser_of
+from benchmarks.learning.runs import MIXED, Run, add_folder, finished_run
 from benchmarks.tables import print_head, print_row
 
 FIGURES = Path(__file__).with_name("results.json")
@@ -161,25 +160,27 @@ def _print_goal(name: str, row: Row, of_seeds: list[dict[str, float]]) -> None:
     print_row(f"`{name}`", *goal, f"{reached} of {len(of_seeds)} seeds")
 
 
-def main(words: list[str]) -> None:
-    """Measure and show what the words ask for."""
-    usage = f"see the text at the head of {__file__}"
-    keys = {"data", "folder", "seeds", "workers"}
-    chosen, given = chosen_words(words, (*ROWS, "show"), keys, f"{usage}; rows: {' '.join(ROWS)}")
-    rows = [name for name in chosen if name != "show"] or [*ROWS]
-    if "show" in chosen and given:
-        sys.exit(f"{' '.join(words)}: show measures nothing, so it takes only rows: {usage}")
-    if "show" not in chosen:
-        if "data" not in given:
-            sys.exit(f"give data=FOLDER, or show: {usage}")
-        folder = runs_folder(given)
-        seeds = [int(seed) for seed in given.get("seeds", "0,1,2").split(",")]
-        with ThreadPoolExecutor(int(given.get("workers", "2"))) as pool:
-            waiting = [pool.submit(measure, name, seed, given["data"], folder) for name in rows for seed in seeds]
+def main() -> None:
+    """Measure the chosen rows, if volumes are given, and print the table."""
+    parser = parser_of(__doc__)
+    parser.add_argument("rows", nargs="*", metavar="ROW", help=f"default: all of {', '.join(ROWS)}")
+    parser.add_argument("--data", help="folder of volumes; without it, only the table is printed")
+    parser.add_argument("--seeds", type=int, nargs="+", default=(0, 1, 2), help="default: 0 1 2")
+    parser.add_argument("--workers", type=count, default=2, help="default: %(default)s")
+    add_folder(parser)
+    given = parser.parse_args()
+    if unknown := [name for name in given.rows if name not in ROWS]:
+        parser.error(f"{unknown[0]!r} is none of {', '.join(ROWS)}")
+    rows = given.rows or [*ROWS]
+    if given.data:
+        with ThreadPoolExecutor(given.workers) as pool:
+            waiting = [
+                pool.submit(measure, name, seed, given.data, given.folder) for name in rows for seed in given.seeds
+            ]
             for each in waiting:
                 each.result()
-    print_tables(rows if "show" in chosen else tuple(ROWS))
+    print_tables(rows)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

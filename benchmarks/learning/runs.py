@@ -5,10 +5,11 @@ A run that has finished is not repeated: its folder is read again. Delete the fo
 
 from __future__ import annotations
 
+import argparse
 import json
 import subprocess
 import sys
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -60,27 +61,15 @@ class Run:
         return max((step for step, _ in self.curve["wall_s"]), default=0)
 
 
-def chosen_words(
-    words: Sequence[str], names: Collection[str], keys: Collection[str], usage: str
-) -> tuple[list[str], dict[str, str]]:
-    """Return the names and the `key=value` pairs among the words of a command; exit with a hint if one is unknown."""
-    chosen = [word for word in words if "=" not in word]
-    given = dict(word.split("=", 1) for word in words if "=" in word)
-    unknown = [word for word in chosen if word not in names]
-    if unknown or given.keys() - keys:
-        sys.exit(f"{' '.join(unknown) or given}: {usage}")
-    return chosen, given
-
-
-def runs_folder(given: Mapping[str, str]) -> Path:
-    """Return the folder of runs that a command names, which is created if missing."""
-    folder = Path(given.get("folder", "benchmark-runs"))
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
+def add_folder(parser: argparse.ArgumentParser) -> None:
+    """Add the option `--folder`, the folder of the runs."""
+    default = Path("benchmark-runs")
+    parser.add_argument("--folder", type=Path, default=default, help="folder of the runs (default: %(default)s)")
 
 
 def finished_run(name: str, overrides: Sequence[str], folder: Path) -> Run:
     """Run `armscan.run` with the overrides, unless a run of that name has finished in the folder already."""
+    folder.mkdir(parents=True, exist_ok=True)
     run_folder = folder / name
     store = f"sqlite:///{folder.absolute()}/mlruns.db"
     if not (run_folder / "run_id").exists():

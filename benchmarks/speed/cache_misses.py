@@ -27,6 +27,7 @@ from armscan.anatomy import PIXEL_TISSUES, Scanner
 from armscan.volumes import LabelVolume, load_phantoms
 from armscan.volumes.rigid_transform import mapped_plane
 from armscan.volumes.slicing import sample_plane
+from benchmarks.arguments import count, parser_of
 from benchmarks.repository import environment
 from benchmarks.tables import print_head, print_row
 
@@ -40,8 +41,8 @@ Batch = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 def main() -> None:
     """Print the table, or look at planes for another process that counts."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--planes", type=int, default=1024, help="planes of each process (default: 1024)")
+    parser = parser_of(__doc__)
+    parser.add_argument("--planes", type=count, default=1024, help="planes of each process (default: 1024)")
     parser.add_argument("--serve", nargs=2, help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.serve:

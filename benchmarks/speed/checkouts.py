@@ -16,6 +16,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from benchmarks.arguments import count, parser_of
 from benchmarks.repository import REPOSITORY, environment
 
 PROGRAM = f"""
@@ -27,13 +28,13 @@ runpy.run_path(sys.argv[0], run_name="__main__")
 """
 
 
-def parser_of(description: str, n_rounds: int | None = None) -> argparse.ArgumentParser:
+def comparing_parser_of(description: str | None, n_rounds: int | None = None) -> argparse.ArgumentParser:
     """Return a parser of the option `--before`, an absolute path or None, and of `--rounds` if it has a default."""
-    parser = argparse.ArgumentParser(description=description.partition("\n")[0])
+    parser = parser_of(description)
     what = "another checkout to compare with"
     parser.add_argument("--before", type=_checkout, metavar="CHECKOUT", help=what)
     if n_rounds:
-        parser.add_argument("--rounds", type=int, default=n_rounds, help=f"turns of each (default: {n_rounds})")
+        parser.add_argument("--rounds", type=count, default=n_rounds, help=f"turns of each (default: {n_rounds})")
     return parser
 
 

@@ -1,6 +1,6 @@
 """Measure the processor time of collecting steps, compared with Tianshou's own collector.
 
-    python -m benchmarks.speed.collecting [ROUNDS]
+    python -m benchmarks.speed.collecting [--rounds 15]
 
 Both collect one step of each of 16 environments at a time, with the same policy, in turn in one process on one thread.
 The time of the environments is measured separately; the rest is the collector's: choosing actions, storing transitions,
@@ -14,7 +14,6 @@ import os
 os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 
 import statistics
-import sys
 import time
 from typing import Any
 
@@ -28,6 +27,7 @@ from armscan.agents.tianshou_envs import TianshouVectorEnv
 from armscan.envs import EnvFactory
 from armscan.utils.log import silence_libraries
 from armscan.volumes import load_phantoms
+from benchmarks.arguments import count, parser_of
 from benchmarks.speed.agent_setup import agent_setup
 from benchmarks.tables import print_head, print_row
 
@@ -84,11 +84,13 @@ def milliseconds(collector: Any) -> tuple[float, float]:
     return seconds / N_COLLECTIONS * 1000.0, collector.env.seconds / N_COLLECTIONS * 1000.0
 
 
-def main(words: list[str]) -> None:
+def main() -> None:
     """Measure every case and print its table."""
+    parser = parser_of(__doc__)
+    parser.add_argument("--rounds", type=count, default=15, help="default: %(default)s")
+    n_rounds = parser.parse_args().rounds
     silence_libraries()
     torch.set_num_threads(1)
-    n_rounds = int(words[0]) if words else 15
     beside = "Tianshou, ms", "ours, ms", "ratio", "without them: Tianshou", "ours", "ratio"
     print_head("16 steps", "environments, ms", *beside)
     for name, (kind, rules) in CASES.items():
@@ -106,4 +108,4 @@ def main(words: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

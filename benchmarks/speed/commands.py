@@ -17,7 +17,7 @@ import tempfile
 from pathlib import Path
 
 from benchmarks.repository import REPOSITORY, VOLUMES, environment
-from benchmarks.speed.checkouts import children_processor_s, parser_of
+from benchmarks.speed.checkouts import children_processor_s, comparing_parser_of
 from benchmarks.tables import print_head, print_row
 
 N_PROCESSES = 3
@@ -27,11 +27,11 @@ UNTIL_IT_TRAINS = (("run",), "training for at most")
 # A command, and the beginning of the line that ends it; None if it ends by itself.
 COMMANDS = {
     "first line of `run`": (("run",), ""),
-    "first line of a grid, `run -m agent=sac,ppo`": (("run", "-m", "agent=sac,ppo"), ""),
-    "first line of a study, `run -m sweep=sac_y`": (STUDY, ""),
-    "a wrong word, `run training.env_steps=-1`": (("run", "training.env_steps=-1"), None),
-    "the same in a grid, `run -m training.env_steps=-1,-9`": (("run", "-m", "training.env_steps=-1,-9"), None),
-    "the same in a study": ((*STUDY, "training.env_steps=-1"), None),
+    "first line of a grid": (("run", "-m", "agent=sac,ppo"), ""),
+    "first line of a study": (STUDY, ""),
+    "an invalid value, `run training.env_steps=-1`": (("run", "training.env_steps=-1"), None),
+    "the same in each job of a grid": (("run", "-m", "training.env_steps=-1,-9"), None),
+    "the same in a study, after its first line": ((*STUDY, "training.env_steps=-1"), None),
     "`run data=nifti` without a path": (("run", "data=nifti"), None),
     "`run resume=zzzz`": (("run", "resume=zzzz"), None),
     "`runs list`": (("runs", "list"), None),
@@ -73,7 +73,7 @@ def processor_s(checkout: Path, folder: str, words: tuple[str, ...] | None, unti
 
 def main() -> None:
     """Print the table."""
-    other = parser_of(__doc__).parse_args().before
+    other = comparing_parser_of(__doc__).parse_args().before
     checkouts = {**({"before": other} if other else {}), "now": REPOSITORY}
     print_head("processor seconds", *checkouts, align="---:")
     with tempfile.TemporaryDirectory() as folder:

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from functools import cache
 
 from benchmarks.repository import REPOSITORY
-from benchmarks.speed.checkouts import ask, parser_of, serve, start
+from benchmarks.speed.checkouts import ask, comparing_parser_of, serve, start
 from benchmarks.tables import print_head, print_row
 
 N_RANDOM_STEPS, BATCH_SIZE, N_AT_ONCE, N_TIANSHOU, N_COMPILED = 1_000, 256, 4, 20, 100
@@ -34,7 +34,7 @@ def main() -> None:
     if sys.argv[1:] == ["--serve"]:
         serve(step_ms)
         return
-    given = parser_of(__doc__, n_rounds=15).parse_args()
+    given = comparing_parser_of(__doc__, n_rounds=15).parse_args()
     print_head("projection, network", "Tianshou, ms", "compiled, ms", "ratio, median", "least", "most")
     with start(__file__, given.before or REPOSITORY) as theirs, start(__file__, REPOSITORY) as ours:
         for case in CASES:

@@ -29,8 +29,8 @@ from sklearn.cluster import DBSCAN
 import armscan
 from armscan.anatomy import PIXEL_TISSUES, Clusters, TissueClusters, landmark_reward
 from armscan.envs import ManipulatorAction
-from armscan.volumes import LabelVolume, read_dataset
-from benchmarks.repository import given_volumes
+from armscan.volumes import LabelVolume
+from benchmarks.arguments import given_volumes
 from benchmarks.tables import print_head, print_row
 
 N_ROUNDS, N_STEPS, N_VECTOR_STEPS, N_PLAIN_STEPS = 15, 2000, 60, 2
@@ -126,7 +126,7 @@ def larger(volume: LabelVolume) -> LabelVolume:
 
 def main() -> None:
     """Print the table."""
-    volumes = read_dataset(given_volumes())
+    volumes = given_volumes(__doc__)
     first = next(iter(volumes.values()))
     one, plain = "one environment, one core", "SimpleITK and scikit-learn"
     measures = {

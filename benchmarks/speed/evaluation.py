@@ -33,7 +33,7 @@ from armscan.envs import EnvFactory
 from armscan.training import Evaluation, evaluate
 from armscan.volumes import load_phantoms
 from benchmarks.speed.agent_setup import agent_setup
-from benchmarks.speed.checkouts import ask, parser_of, serve, start
+from benchmarks.speed.checkouts import ask, comparing_parser_of, serve, start
 from benchmarks.tables import print_head, print_row
 
 if TYPE_CHECKING:
@@ -141,7 +141,7 @@ def measure(case: str, before: Callable[[str], list[float]] | None) -> list[str]
 
 def main() -> None:
     """Print the table, or play episodes for the process that prints it."""
-    parser = parser_of(__doc__)
+    parser = comparing_parser_of(__doc__)
     parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
     parser.add_argument("parts", nargs="*", help="Parts of the names of cases. Default: all cases.")
     given = parser.parse_args()

@@ -15,8 +15,9 @@ from pathlib import Path
 from mlflow import MlflowClient
 from mlflow.entities import Metric, Param, RunTag
 
+from benchmarks.arguments import count
 from benchmarks.repository import REPOSITORY
-from benchmarks.speed.checkouts import parser_of, run_timed
+from benchmarks.speed.checkouts import comparing_parser_of, run_timed
 from benchmarks.tables import print_head, print_row
 from tests.support.mlflow_server import mlflow_server
 
@@ -68,9 +69,9 @@ def copy_run(client: MlflowClient, folder: Path, *, n_runs: int, n_epochs: int) 
 
 def main() -> None:
     """Print the table."""
-    parser = parser_of(__doc__)
-    parser.add_argument("--runs", type=int, default=200, help="runs in the store (default: 200)")
-    parser.add_argument("--epochs", type=int, default=20, help="epochs of each (default: 20)")
+    parser = comparing_parser_of(__doc__)
+    parser.add_argument("--runs", type=count, default=200, help="runs in the store (default: 200)")
+    parser.add_argument("--epochs", type=count, default=20, help="epochs of each (default: 20)")
     given = parser.parse_args()
     checkouts = {**({"before": given.before} if given.before else {}), "now": REPOSITORY}
     with tempfile.TemporaryDirectory() as name:
@@ -78,13 +79,14 @@ def main() -> None:
         uri = f"sqlite:///{folder}/mlruns.db"
         armscan(REPOSITORY, folder, "run", *SMALL, uri=uri)
         copy_run(MlflowClient(uri), folder, n_runs=given.runs, n_epochs=given.epochs)
-        print_head(f"{given.runs} runs: processor s (wall s)", *checkouts, align="---:")
+        columns = (f"{name}, {seconds} s" for seconds in ("processor", "wall") for name in checkouts)
+        print_head(f"{given.runs} runs", *columns, align="---:")
         with mlflow_server(folder / "server", uri) as server:
             for store, address in {"SQLite": uri, "a server": server.uri}.items():
                 for command, words in COMMANDS.items():
                     both = (armscan(checkout, folder, *words, uri=address) for checkout in checkouts.values())
-                    cells = (f"{processor_s:.1f} ({wall_s:.1f})" for processor_s, wall_s in both)
-                    print_row(f"{command}, {store}", *cells)
+                    seconds = (each for measured in zip(*both, strict=True) for each in measured)
+                    print_row(f"{command}, {store}", *(f"{each:.1f}" for each in seconds))
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ million steps, resets included, the memory of a process should stay as it was af
 from __future__ import annotations
 
 import multiprocessing
-import sys
 import time
 from collections.abc import Callable, Sequence
 
@@ -18,7 +17,8 @@ import psutil
 
 import armscan  # noqa: F401 - registers the environment
 from armscan.envs import make_armscan_env, make_armscan_vector_env
-from armscan.volumes import LabelVolume, ManipulatorAction, load_phantoms, read_dataset
+from armscan.volumes import LabelVolume, ManipulatorAction, load_phantoms
+from benchmarks.arguments import labelmaps, parser_of
 from benchmarks.tables import print_head, print_row
 
 NUM_ENVS, N_VOLUMES, N_STEPS = 64, 8, 40
@@ -81,10 +81,9 @@ def bytes_over_steps(volumes: Sequence[LabelVolume], num_envs: int) -> list[floa
 
 def main() -> None:
     """Print the tables."""
-    if len(sys.argv) > 1:
-        volumes = list(read_dataset(sys.argv[1]).values())
-    else:
-        volumes = list(load_phantoms(range(N_VOLUMES)).values())
+    parser = parser_of(__doc__)
+    parser.add_argument("volumes", metavar="FOLDER", type=labelmaps, nargs="?", help="default: phantoms")
+    volumes = list((parser.parse_args().volumes or load_phantoms(range(N_VOLUMES))).values())
     n_voxels = sum(volume.labels.size for volume in volumes)
     print(f"{len(volumes)} volumes, {n_voxels / 2**20:.0f} MiB of voxels as uint8; {NUM_ENVS} environments\n")
     print_head("", "MiB that the volumes add", "times their voxels")

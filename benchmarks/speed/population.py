@@ -24,6 +24,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from benchmarks.arguments import parser_of
 from benchmarks.repository import REPOSITORY
 from benchmarks.speed.checkouts import ask_all, serve, start
 from benchmarks.tables import print_head, print_row
@@ -169,7 +170,7 @@ _UPDATERS: dict[tuple[str, str], Callable[[float], float]] = {}
 
 def main() -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--seconds", type=float, default=5.0, help="of each measurement (default: 5)")
     parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
     given = parser.parse_args()

@@ -17,8 +17,7 @@ from collections.abc import Callable
 import numpy as np
 
 from armscan.envs import ArmscanEnv
-from armscan.volumes import read_dataset
-from benchmarks.repository import given_volumes
+from benchmarks.arguments import given_volumes
 from benchmarks.tables import print_head, print_row
 
 N_FRAMES = 200
@@ -42,7 +41,7 @@ def median_seconds(env: ArmscanEnv, after_step: Callable[[], object]) -> tuple[f
 
 def main() -> None:
     """Print the table."""
-    env = ArmscanEnv(read_dataset(given_volumes()), projection="zy", render_mode="rgb_array")
+    env = ArmscanEnv(given_volumes(__doc__), projection="zy", render_mode="rgb_array")
     env.action_space.seed(0)
     for name in env.volumes:
         # Fonts, and the two sides of each volume, are prepared once.

@@ -35,7 +35,7 @@ from armscan.agents.image_replay import replay_for
 from armscan.agents.replay import Replay
 from armscan.envs import EnvFactory, SliceChannelsObservation
 from armscan.volumes import read_dataset
-from benchmarks.repository import given_volumes
+from benchmarks.arguments import given_volumes
 from benchmarks.tables import print_head, print_row
 
 N_ENVS, N_PLAYED, N_PLAIN, N_TRANSITIONS = 16, 10_000, 20_000, 1_000_000
@@ -156,9 +156,9 @@ def measure(folder: str | Path, name: str, near: tuple) -> None:
 
 def main() -> None:
     """Print a table for each kind of episode, each measured in its own process."""
-    context = multiprocessing.get_context("spawn")
+    context, volumes = multiprocessing.get_context("spawn"), given_volumes(__doc__)
     for name, near in (("short episodes", NEAR_SHORT), ("long episodes", NEAR_LONG)):
-        child = context.Process(target=measure, args=(given_volumes(), name, near))
+        child = context.Process(target=measure, args=(volumes, name, near))
         child.start()
         child.join()
         if child.exitcode:

@@ -10,13 +10,14 @@ The first training of the process compiles, those after it are measured.
 
 from __future__ import annotations
 
-import argparse
 import os
 import statistics
 import time
 from typing import Any
 
 import numpy as np
+
+from benchmarks.arguments import count, parser_of
 
 N_STEPS, N_ENVS, LEARNING_STARTS, N_UPDATES = 20_000, 16, 2_000, 4
 N_TRAININGS = 2
@@ -98,8 +99,8 @@ def train(envs: Any, seed: int) -> float:
 
 def main() -> None:
     """Print the figures."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--threads", type=int, default=1, help="processor cores to use (default: 1)")
+    parser = parser_of(__doc__)
+    parser.add_argument("--threads", type=count, default=1, help="processor cores to use (default: 1)")
     given = parser.parse_args()
     # Before JAX and Numba count the cores.
     os.environ |= {name: str(given.threads) for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS")}

@@ -1,8 +1,8 @@
 """Measure the memory of several workers that train on the same phantoms, and the time to load these.
 
-    python -m benchmarks.speed.shared_memory [WORKERS] [PHANTOMS]
+    python -m benchmarks.speed.shared_memory [--workers 8] [--phantoms 128]
 
-Default: 8 workers, 128 phantoms. Each imports what a training imports, builds a default SAC learner and its
+Each worker imports what a training imports, builds a default SAC learner and its
 environments, takes some steps and gradient steps, and reads every voxel. Measured is the sum of their proportional set
 sizes (PSS: a page that several processes map counts for each by its share), which counts no page twice.
 """
@@ -11,13 +11,13 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import sys
 import time
 from multiprocessing.synchronize import Barrier
 from pathlib import Path
 from typing import Any
 
 from armscan.volumes import load_phantoms
+from benchmarks.arguments import count, parser_of
 from benchmarks.tables import print_head, print_row
 
 N_STEPS = 400
@@ -54,9 +54,13 @@ def work(n_phantoms: int, together: Barrier, answers: Any) -> None:
     together.wait()
 
 
-def main(words: list[str]) -> None:
+def main() -> None:
     """Print the table."""
-    n_workers, n_phantoms = (int(word) for word in (*words, *("8", "128")[len(words) :]))
+    parser = parser_of(__doc__)
+    parser.add_argument("--workers", type=count, default=8, help="default: %(default)s")
+    parser.add_argument("--phantoms", type=count, default=128, help="default: %(default)s")
+    given = parser.parse_args()
+    n_workers, n_phantoms = given.workers, given.phantoms
     n_voxels = sum(volume.labels.size for volume in load_phantoms(range(n_phantoms)).values())
     context = multiprocessing.get_context("spawn")
     together, answers = context.Barrier(n_workers, timeout=WAIT_S), context.Queue()
@@ -76,4 +80,4 @@ def main(words: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

@@ -17,7 +17,7 @@ from functools import cache
 from typing import Any
 
 from benchmarks.repository import REPOSITORY
-from benchmarks.speed.checkouts import ask, parser_of, serve, start
+from benchmarks.speed.checkouts import ask, comparing_parser_of, serve, start
 from benchmarks.tables import print_head, print_row
 
 N_STEPS = 2000
@@ -38,7 +38,7 @@ def main() -> None:
     if sys.argv[1:] == ["--serve"]:
         serve(step_s)
         return
-    parser = parser_of(__doc__, n_rounds=15)
+    parser = comparing_parser_of(__doc__, n_rounds=15)
     given = parser.parse_args()
     if given.before is None:
         parser.error("--before is not given: name the checkout to compare with")

@@ -15,7 +15,6 @@ import os
 
 os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 
-import argparse
 import statistics
 import tempfile
 import threading
@@ -34,6 +33,8 @@ from armscan.experiment.runner import train_agent
 from armscan.tracking import TrackedRun, open_store
 from armscan.training import EpochReport
 from armscan.utils.log import silence_libraries
+from benchmarks.arguments import count, parser_of
+from benchmarks.tables import print_head, print_row
 from tests.support.mlflow_server import MlflowServer, mlflow_server
 
 THREADS = ("uploader", "pending", "system metrics")
@@ -159,9 +160,9 @@ def ways(folder: Path) -> Iterator[dict[str, Callable[[Any], Cost]]]:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser()
+    parser = parser_of(__doc__)
     for option, default in (("--rounds", 3), ("--env-steps", 20_000), ("--every", 1000)):
-        parser.add_argument(option, type=int, default=default)
+        parser.add_argument(option, type=count, default=default, help="default: %(default)s")
     given = parser.parse_args()
     silence_libraries()
     config, _ = compose_run(
@@ -179,17 +180,14 @@ def main() -> None:
             for name, measure in compared.items():
                 costs[name].append(measure(config))
                 print(f"round {number}, {name}: {costs[name][-1]}", flush=True)
-    print(f"\n{'tracking':<12} wall (s)         ratio  calls (s)  threads (s)  at most   longest call (ms)")
-    base = statistics.median(cost.wall_s for cost in costs["untracked"])
+    print_head("tracked", "wall, s", "calls, s", "threads, s", "share, at most", "longest call, ms")
     for name, of_name in costs.items():
         wall, calls, threads, share = (
             statistics.median(getattr(cost, field) for cost in of_name)
             for field in ("wall_s", "calls_s", "threads_s", "share")
         )
         longest_ms = 1000 * max(cost.longest_s for cost in of_name)
-        print(
-            f"{name:<12} {wall:8.1f} {wall / base:13.3f} {calls:10.4f} {threads:12.2f} {share:8.2%} {longest_ms:19.2f}"
-        )
+        print_row(name, f"{wall:.1f}", f"{calls:.3f}", f"{threads:.2f}", f"{100 * share:.1f} %", f"{longest_ms:.1f}")
 
 
 if __name__ == "__main__":

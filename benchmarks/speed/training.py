@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from benchmarks.repository import REPOSITORY
-from benchmarks.speed.checkouts import parser_of, run_timed
+from benchmarks.speed.checkouts import comparing_parser_of, run_timed
 from benchmarks.tables import print_head, print_row
 
 CASES = {"default": ["training.solved=null"], "make_run": [], "best_full": ["experiment=best_full"]}
@@ -61,7 +61,7 @@ def run(checkout: Path, *words: str) -> Run:
 
 def main() -> None:
     """Print the table."""
-    parser = parser_of(__doc__, n_rounds=3)
+    parser = comparing_parser_of(__doc__, n_rounds=3)
     parser.add_argument("cases", nargs="*", metavar="CASE", help=f"{', '.join(CASES)} (default: the first two)")
     given = parser.parse_args()
     if unknown := set(given.cases) - set(CASES):

@@ -15,7 +15,7 @@ import tempfile
 from pathlib import Path
 
 from benchmarks.repository import REPOSITORY, environment
-from benchmarks.speed.checkouts import parser_of
+from benchmarks.speed.checkouts import comparing_parser_of
 from benchmarks.tables import print_head, print_row
 
 # Python imports this `sitecustomize` at the start of each process; in the worker's, it times the trials.
@@ -77,7 +77,7 @@ def trial_seconds(checkout: Path, n_trials: int) -> list[float]:
 
 def main() -> None:
     """Print the table."""
-    parser = parser_of(__doc__)
+    parser = comparing_parser_of(__doc__)
     parser.add_argument("--trials", type=int, default=4, help="trials of each (default: 4)")
     given = parser.parse_args()
     if given.trials < 2:

@@ -1,6 +1,6 @@
 """Measure the gradient steps per second of SAC, by device, precision and compilation.
 
-    python -m benchmarks.speed.updates [PART-OF-A-NAME ...]
+    python -m benchmarks.speed.updates [PART ...]
 
 SAC on phantoms, with batches of 256: a replay buffer of random steps, then rounds of Tianshou's own update, in each way
 in turn (`compiled_update.py` measures the one that Numba compiles). The figures to quote are the ratios to float32
@@ -15,7 +15,6 @@ import os
 os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 
 import statistics
-import sys
 import time
 from functools import partial
 
@@ -27,6 +26,7 @@ from armscan.agents import MLP, SAC, Compute, Multimodal, Network
 from armscan.envs import EnvFactory, SliceChannelsObservation
 from armscan.utils.log import silence_libraries
 from armscan.volumes import load_phantoms
+from benchmarks.arguments import parser_of
 from benchmarks.speed.agent_setup import agent_setup
 from benchmarks.tables import print_head, print_row
 
@@ -76,13 +76,16 @@ def updater(env_factory: EnvFactory, network: Network, compute: Compute, *, by_t
     return measure
 
 
-def main(words: list[str]) -> None:
+def main() -> None:
     """Measure every case and print its table."""
+    parser = parser_of(__doc__)
+    parser.add_argument("parts", nargs="*", metavar="PART", help="part of a case's name (default: all cases)")
+    parts = parser.parse_args().parts
     silence_libraries()
     torch.set_num_threads(1)
-    chosen = {name: case for name, case in CASES.items() if not words or any(word in name for word in words)}
+    chosen = {name: case for name, case in CASES.items() if not parts or any(part in name for part in parts)}
     if not chosen:
-        sys.exit(f"{' '.join(words)} is part of no name: {', '.join(CASES)}")
+        parser.error(f"{' '.join(parts)} is part of no name: {', '.join(CASES)}")
     print_head("observation, network", "computed", "updates/s, median", "best", "beside the first")
     for name, (env_factory, network) in chosen.items():
         measures = {way: updater(env_factory, network, compute, by_tianshou=True) for way, compute in ways().items()}
@@ -98,4 +101,4 @@ def main(words: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

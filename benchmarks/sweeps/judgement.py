@@ -14,7 +14,6 @@ control: the share whose 95 % interval of chosen minus control contains the true
 
 from __future__ import annotations
 
-import argparse
 from itertools import product
 from typing import NamedTuple
 
@@ -25,6 +24,7 @@ from armscan.stats.aggregation import probability_of_improvement
 from armscan.stats.bootstrap import LOWER, N_RESAMPLES, UPPER
 from armscan.stats.paired import crossed_mean
 from armscan.sweeps.scheduling.race import MAX_SEEDS_FACTOR, race
+from benchmarks.arguments import count, parser_of
 from benchmarks.tables import print_head, print_row
 
 N_CANDIDATES, N_VALIDATION, MIN_SEEDS, MEAN_SEEDS = 4, 8, 2, 12
@@ -101,8 +101,8 @@ def holds(differences: np.ndarray, truth: float) -> bool:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--studies", type=int, default=2000)
+    parser = parser_of(__doc__)
+    parser.add_argument("--studies", type=count, default=2000, help="default: %(default)s")
     n_studies = parser.parse_args().studies
     intervals = "difference", "probability of improvement", "percentile bootstrap of the seeds"
     names = *intervals, "studies", "trainings to select"

@@ -1,6 +1,6 @@
 """Measure pruning with two objectives: the hypervolume kept and the environment steps taken.
 
-    python -m benchmarks.sweeps.pareto [folder=FOLDER] [trials=60] [replays=200]
+    python -m benchmarks.sweeps.pareto [--folder FOLDER] [--trials 60] [--replays 200]
 
 Two studies with random sampling and no pruning are replayed with `study/pruner=pareto`, each time in another random
 order. A replayed trial is the same training until it is pruned, so that only the pruning differs.
@@ -12,7 +12,6 @@ order. A replayed trial is the same training until it is pruned, so that only th
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate
@@ -29,8 +28,9 @@ from armscan.sweeps.scheduling.state import env_steps_of, loss_signs
 from armscan.sweeps.storage.attribute_names import ENV_STEPS
 from armscan.sweeps.storage.reports import REPORT, reports_of, store_report
 from armscan.sweeps.study.pruners import ParetoPruner
+from benchmarks.arguments import add_options_of, call, parser_of
 from benchmarks.sweeps.bench.table import VALIDATION, read_rows, table_file
-from benchmarks.sweeps.studies import call, run_study
+from benchmarks.sweeps.studies import run_study
 
 WORDS = ("projection=y", "training.env_steps=8000", "training.eval_every_env_steps=1000")
 DIRECTIONS = (StudyDirection.MAXIMIZE, StudyDirection.MINIMIZE)
@@ -137,4 +137,6 @@ def main(folder: Path, *, trials: int = 60, replays: int = 200) -> None:
 
 
 if __name__ == "__main__":
-    call(main, sys.argv[1:])
+    parser = parser_of(__doc__)
+    add_options_of(parser, main)
+    call(main, parser.parse_args())

@@ -1,6 +1,6 @@
 """Measure what pruning saves: the study `sac_y` with its pruner, and without one.
 
-    python -m benchmarks.sweeps.pruning [folder=FOLDER] [seeds=0,1,2] [trials=40]
+    python -m benchmarks.sweeps.pruning [--folder FOLDER] [--seeds 0 1 2] [--trials 40]
 
 Both studies of a seed sample the same random points, so that a trial is the same training in both until it is pruned,
 and only the pruning differs. Studies already in the folder are resumed.
@@ -8,13 +8,14 @@ and only the pruning differs. Studies already in the folder are resumed.
 
 from __future__ import annotations
 
-import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from optuna.trial import FrozenTrial, TrialState
 
 from armscan.sweeps.scheduling.state import StudyState, env_steps_of
-from benchmarks.sweeps.studies import call, run_study
+from benchmarks.arguments import add_options_of, call, parser_of
+from benchmarks.sweeps.studies import run_study
 
 STUDIES = {"plain": ["study/pruner=none"], "pruned": []}
 
@@ -56,11 +57,13 @@ def compare(folder: Path, seed: int, n_trials: int) -> None:
     )
 
 
-def main(folder: Path, *, seeds: str | int = "0,1,2", trials: int = 40) -> None:
-    """Compare the studies of each seed; a single seed is a number."""
-    for seed in map(int, str(seeds).split(",")):
+def main(folder: Path, *, seeds: Sequence[int] = (0, 1, 2), trials: int = 40) -> None:
+    """Compare the studies of each seed."""
+    for seed in seeds:
         compare(folder / f"seed_{seed}", seed, trials)
 
 
 if __name__ == "__main__":
-    call(main, sys.argv[1:])
+    parser = parser_of(__doc__)
+    add_options_of(parser, main)
+    call(main, parser.parse_args())

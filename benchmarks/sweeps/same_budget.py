@@ -1,6 +1,7 @@
 """Compare the configurations that armscan and Hydra's Optuna sweeper find with the same processor time.
 
-    python -m benchmarks.sweeps same_budget [folder=FOLDER] [tasks=[sac_y,sac_zy]] [first=0] [replicates=4] [seeds=8]
+    python -m benchmarks.sweeps same-budget [--folder FOLDER] [--tasks sac_y sac_zy] [--first 0] [--replicates 4]
+                                            [--seeds 8]
 
 In each replicate, both search once. The replicate's number is the seed of both samplers, and determines the seeds of
 its trainings. Both sides have the same space, presets, training seeds and objective, and train one trial at a time
@@ -14,7 +15,7 @@ its trainings. Both sides have the same space, presets, training seeds and objec
 A trial starts while budget is left, and always runs to its end. Both results and the default configuration are then
 trained with new seeds, and judged by the objective on the test volumes. Each outcome is a line of `results.jsonl`:
 the same command continues after an interruption, and repeats only the search that was cut off. Several processes may
-share the folder if their replicates or tasks differ. `replicates=0` prints the table of all results so far.
+share the folder if their replicates or tasks differ. `--replicates 0` prints the table of all results so far.
 """
 
 from __future__ import annotations
@@ -95,12 +96,12 @@ def same_budget(
         replicates: Number of replicates. Default: 4.
         seeds: Number of seeds that judge each configuration. Default: 8.
     """
-    if not isinstance(tasks, list | tuple) or not {*tasks} <= TASKS.keys():
-        sys.exit(f"tasks is {tasks}, but it must be a list of {', '.join(TASKS)}, such as tasks=[sac_y]")
+    if unknown := [name for name in tasks if name not in TASKS]:
+        sys.exit(f"--tasks: {unknown[0]!r} is none of {', '.join(TASKS)}")
     silence_libraries()
     results = Results(folder / "results.jsonl")
     if not replicates and not results.rows:
-        sys.exit(f"{folder} has no results.jsonl: give the folder of a comparison, or replicates=N")
+        sys.exit(f"{folder} has no results.jsonl: give the folder of a comparison, or --replicates N")
     with contextlib.chdir(folder):
         for replicate in range(first, first + replicates):
             for name in tasks:

@@ -9,7 +9,6 @@ and only the storage is measured.
 
 from __future__ import annotations
 
-import argparse
 import multiprocessing
 import tempfile
 import threading
@@ -36,6 +35,7 @@ from armscan.sweeps.workers.heartbeat import Heartbeat
 from armscan.sweeps.workers.worker import Worker
 from armscan.tracking import open_store
 from armscan.utils.retry import RetryPolicy
+from benchmarks.arguments import count, parser_of
 from benchmarks.tables import print_head, print_row
 from tests.support.mlflow_server import mlflow_server
 from tests.support.postgres import PostgresServer, postgres_server
@@ -205,9 +205,9 @@ def row(took_s: float, n_trials: int, of_storage: Asked, of_mlflow: Asked | None
 
 def main() -> None:
     """Print a row for each number of workers."""
-    parser = argparse.ArgumentParser()
+    parser = parser_of(__doc__)
     parser.add_argument("--tracking", action="store_true")
-    parser.add_argument("--workers", type=int, nargs="+", default=WORKERS)
+    parser.add_argument("--workers", type=count, nargs="+", default=WORKERS)
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as name, postgres_server(**SETTINGS) as server:
         server.execute("CREATE EXTENSION pg_stat_statements")

@@ -22,6 +22,7 @@ from armscan.sweeps.storage.storage import existing_storage
 from armscan.tracking.store import open_existing_store
 from armscan.ui.runs_page import runs_page
 from armscan.ui.servers import HOST, mlflow_server, start_dashboard
+from benchmarks.arguments import parser_of
 from benchmarks.repository import PICTURES
 from tests.support.browser import chromium
 
@@ -66,7 +67,9 @@ def make_small(file: Path) -> None:
 
 def main() -> None:
     """Run the study unless it is finished, and save the pictures."""
-    folder = Path(sys.argv[1] if len(sys.argv) > 1 else "screenshots")
+    parser = parser_of(__doc__)
+    parser.add_argument("folder", nargs="?", type=Path, default=Path("screenshots"), help="default: %(default)s")
+    folder = parser.parse_args().folder
     folder.mkdir(parents=True, exist_ok=True)
     os.chdir(folder)
     subprocess.run([sys.executable, "-m", "armscan.run", *STUDY], check=True)

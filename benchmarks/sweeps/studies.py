@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import inspect
 import subprocess
 import sys
-import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import optuna
-import yaml
 from optuna.trial import FrozenTrial
 
 from armscan.sweeps.scheduling.state import StudyState
@@ -33,17 +30,6 @@ os.sched_getaffinity = lambda _: range(64)
 from armscan.run import main
 sys.exit(main())
 """
-
-
-def call(measure: Callable[..., None], words: Sequence[str]) -> None:
-    """Call a function with the values of the words `folder=FOLDER` and `key=value`; default: a temporary folder."""
-    given = dict(word.split("=", 1) for word in words)
-    allowed = inspect.signature(measure).parameters
-    if unknown := [key for key in given if key not in allowed]:
-        sys.exit(f"there is no key {unknown[0]!r}, but only {', '.join(allowed)}")
-    folder = Path(given.pop("folder", "") or tempfile.mkdtemp()).absolute()
-    folder.mkdir(parents=True, exist_ok=True)
-    measure(folder, **{name: yaml.safe_load(text) for name, text in given.items()})
 
 
 def started(
