@@ -13,8 +13,9 @@ from rich.text import Text
 from armscan.config.command_hints import armscan_command
 from armscan.errors import printable
 from armscan.experiment.console import print_result_table, print_where_to_look
+from armscan.sweeps.results.difference import HOW
 from armscan.sweeps.results.final_results import final_table
-from armscan.sweeps.results.judgement import HOW, judge
+from armscan.sweeps.results.judgement import judge
 from armscan.sweeps.results.progress import status_line
 from armscan.sweeps.results.selection import candidates_of, objective_of
 from armscan.sweeps.scheduling.population import searched_values

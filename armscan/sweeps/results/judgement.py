@@ -3,113 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import compress
-from typing import NamedTuple
 
-import numpy as np
-import optuna
-from optuna.trial import FrozenTrial, TrialState
+from optuna.trial import TrialState
 
 from armscan.experiment.results import volume_notes
-from armscan.stats.aggregation import probability_of_improvement
-from armscan.stats.bootstrap import UNKNOWN, Estimate
-from armscan.stats.paired import paired_difference
-from armscan.sweeps.results.final_results import (
-    ConfigResult,
-    bounds_in,
-    final_results,
-    final_table,
-    scores_of,
-    subjects_of,
-)
-from armscan.sweeps.scheduling.state import CONTROL, TEST_PREFIX, metrics_of_test
+from armscan.sweeps.results.difference import Difference, differences_of
+from armscan.sweeps.results.final_results import ConfigResult, final_results
+from armscan.sweeps.scheduling.state import CONTROL
 from armscan.sweeps.space.parameter import overrides_of
-from armscan.sweeps.storage.attribute_names import METRICS, OBJECTIVES
-from armscan.sweeps.study.candidates import NOTHING_SEARCHED, name_of, settings_of, training_of
+from armscan.sweeps.study.candidates import name_of, settings_of, training_of
 from armscan.sweeps.study.final_eval import FinalEvaluation, to_judge
-from armscan.sweeps.study.study import best_trials, change_notes
+from armscan.sweeps.study.study import change_notes
 from armscan.training.baselines import RANDOM
-from armscan.training.episode_results import TEST_METRICS
 from armscan.training.headline import headline
-from armscan.training.metric_display import is_rate, leading_among, title_of, value_text
-from armscan.training.metrics import ENDS
-from armscan.utils.text import PERCENT, counted, formatted, is_zero, markdown_table
-
-MAXIMIZE = "maximize"
-# Prefixes of the metrics of a study's run that compare the chosen configuration with the control.
-COMPARISONS = ("difference", "probability_of_improvement")
-HOW = (
-    "A difference is the mean of the paired differences over all seeds and test volumes; its interval is for other "
-    "seeds and subjects. The probability of improvement is the probability that a training of the chosen configuration "
-    "is better on a volume than one of the control. Rates differ by percentage points."
-)
-
-
-class Difference(NamedTuple):
-    """Difference of a metric between the chosen configuration and the control.
-
-    Args:
-        metric: Name of the metric.
-        is_higher_better: Whether higher values are better.
-        paired: Mean difference (chosen minus control) over the seeds and volumes, with its 95 % interval.
-        probability: Probability that a training of the chosen one is better on a volume than one of the control.
-        n_left_out: Number of test volumes that are left out, because a training has no value there. Default: 0.
-    """
-
-    metric: str
-    is_higher_better: bool
-    paired: Estimate
-    probability: Estimate
-    n_left_out: int = 0
-
-    @property
-    def is_constant(self) -> bool:
-        """Whether all differences are equal up to rounding: then there is no interval."""
-        return math.isfinite(self.paired.low) and not self.paired.has_width
-
-    @property
-    def estimate(self) -> Estimate:
-        """The mean difference, without an interval if all differences are equal."""
-        return self.paired.if_wide
-
-    @property
-    def verdict(self) -> str:
-        """Return `better` or `worse` according to the interval; empty if it includes 0, or there is none."""
-        above, below = ("better", "worse") if self.is_higher_better else ("worse", "better")
-        return above if self.estimate.low > 0 else below if self.estimate.high < 0 else ""
-
-    def row(self) -> dict[str, str]:
-        """Return its row of a table: cells by column."""
-        _, low, high = map(self._text, self.paired)
-        interval = f"{low} to {high}" if math.isfinite(self.paired.low) else ""
-        if self.is_constant:
-            interval = "none: all differences are equal"
-        better = "higher" if self.is_higher_better else "lower"
-        return {
-            "on the test volumes": f"{title_of(self.metric)} ({better} is better)",
-            "chosen minus control": self.value_text,
-            "95 % interval": interval,
-            "probability of improvement": (
-                "" if math.isnan(self.probability.value) else formatted(PERCENT, self.probability.value)
-            ),
-            "its 95 % interval": _interval_of(self.probability),
-        }
-
-    @property
-    def value_text(self) -> str:
-        """The mean difference with its sign and unit, such as `+4.2 points`."""
-        if math.isnan(self.paired.value):
-            return ""
-        return f"{self._text(self.paired.value)}{' points' if is_rate(self.metric) else ''}"
-
-    def _text(self, value: float) -> str:
-        size = value_text(self.metric, abs(value)).removesuffix("%")
-        # A difference that is not 0 must not look like it.
-        if value and is_zero(size):
-            size = f"{abs(value):.2g}"
-        return f"{'-' if value < 0 else '+'}{size}"
+from armscan.training.metric_display import title_of
+from armscan.utils.text import counted
 
 
 @dataclass(frozen=True)
@@ -221,16 +131,6 @@ class Judgement:
         )
 
 
-def _interval_of(probability: Estimate) -> str:
-    if math.isnan(probability.low):
-        return ""
-    # A digit more where an end that excludes 50 % would be rounded to it.
-    form = PERCENT
-    if (probability.low > 0.5 or probability.high < 0.5) and "50%" in map(PERCENT.format, probability[1:]):
-        form = "{:.1%}"
-    return f"{formatted(form, probability.low)} to {formatted(form, probability.high)}"
-
-
 def judge(final: FinalEvaluation) -> Judgement | None:
     """Return the judgement on the test volumes; None before a configuration is chosen."""
     race = final.race()
@@ -241,7 +141,7 @@ def judge(final: FinalEvaluation) -> Judgement | None:
     now = [judged[number, seed] for number in both for seed in final.judge_seeds if (number, seed) in judged]
     seeds = [seed for seed in final.judge_seeds if all((number, seed) in judged for number in both)]
     pairs = [[judged[number, seed] for seed in seeds] for number in both]
-    differences = _differences(final.search, *pairs) if seeds and chosen != CONTROL else ()
+    differences = differences_of(final.search, *pairs) if seeds and chosen != CONTROL else ()
     complete = final.judgement.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
     others = sorted({training_of(trial)[0] for trial in complete} - set(both))
     results, searched = tuple(final_results(now)), final.search.get_trials(deepcopy=False)
@@ -260,82 +160,3 @@ def judge(final: FinalEvaluation) -> Judgement | None:
         changes=change_notes(final.search),
         have_others_failed=bool(of_others) and all(standing.has_failed for standing in of_others),
     )
-
-
-def best_metrics(search: optuna.Study, judgement: Judgement | None) -> dict[str, float]:
-    """Return the leading metrics of a study's result, by the names that runs use; before it has one, of its best trial.
-
-    Metrics that are not there are NaN, in place of those of an earlier result, which MLflow cannot delete: validation
-    metrics of the control, differences, and intervals.
-
-    Args:
-        search: Study of the search.
-        judgement: Its judgement; None without one.
-    """
-    best = best_trials(search, 1)
-    found = _leading("validation", best[0].user_attrs.get(METRICS, {}) if best else {})
-    if judgement is None or (chosen := judgement.of_chosen) is None:
-        return found
-    found = dict.fromkeys(found, math.nan)
-    if judgement.chosen != CONTROL:
-        trials = search.get_trials(deepcopy=False)
-        found |= _leading("validation", trials[judgement.chosen].user_attrs.get(METRICS, {}))
-    of_chosen = chosen.figures.metrics()
-    found |= _leading(TEST_METRICS, of_chosen)
-    if (of_random := chosen.baselines.get(RANDOM)) is not None:
-        found |= _leading(RANDOM, of_random.metrics())
-    compared = (*(name for name in search.user_attrs[OBJECTIVES] if name in of_chosen), *leading_among(of_chosen))
-    found |= dict.fromkeys((name for key in COMPARISONS for each in compared for name in _names(key, each)), math.nan)
-    for each in judgement.differences:
-        for key, estimate in zip(COMPARISONS, (each.estimate, each.probability), strict=True):
-            found |= dict(zip(_names(key, each.metric), estimate, strict=True))
-    return found
-
-
-def _leading(prefix: str, metrics: Mapping[str, float]) -> dict[str, float]:
-    """Return the leading metrics that are not NaN, by their names in MLflow."""
-    return {f"{prefix}/{name}": metrics[name] for name in leading_among(metrics) if not math.isnan(metrics[name])}
-
-
-def _names(key: str, metric: str) -> list[str]:
-    """Return the names of an estimate and of the ends of its interval."""
-    return [f"{key}/{metric}{end}" for end in ("", *ENDS)]
-
-
-def result_note(judgement: Judgement | None) -> str:
-    """Return the result of a study in Markdown, as the study prints it; empty before a configuration was judged."""
-    if judgement is None or judgement.of_chosen is None:
-        return ""
-    settings = (f"{name}: {f'`{each}`' if each else NOTHING_SEARCHED}" for name, each in judgement.settings.items())
-    parts = [f"**{judgement.result}**", *settings, "The test volumes:", final_table(judgement.results).markdown()]
-    if rows := [each.row() for each in judgement.differences]:
-        parts += [f"{judgement.compared}:", markdown_table([*rows[0]], [[*row.values()] for row in rows]), HOW]
-    return "\n\n".join([*parts, *(f"Note: {note}." for note in judgement.notes)])
-
-
-def _differences(
-    search: optuna.Study, chosen: Sequence[FrozenTrial], control: Sequence[FrozenTrial]
-) -> Iterator[Difference]:
-    """Yield the differences of the metrics that all trainings have; both have the same seeds in the same order."""
-    metrics = [trial.user_attrs[METRICS] for trial in (*chosen, *control)]
-    common = set.intersection(*map(set, metrics))
-    tested = [name for name in metrics_of_test(metrics[0]) if TEST_PREFIX + name in common]
-    objectives, subject_of = search.user_attrs[OBJECTIVES], subjects_of((*chosen, *control))
-    # First the objectives, by which the configuration was selected.
-    for name in dict.fromkeys((*(name for name in objectives if name in tested), *leading_among(tested))):
-        volumes, scores = scores_of(TEST_PREFIX + name, metrics)
-        is_known = np.asarray(np.isfinite(scores).all(axis=0))
-        is_higher_better = objectives[name] == MAXIMIZE if name in objectives else is_rate(name)
-        if not is_known.any():
-            # Without a common test volume, there is nothing to compare.
-            if len(is_known) and name in objectives:
-                yield Difference(name, is_higher_better, UNKNOWN, UNKNOWN, len(is_known))
-            continue
-        volumes, scores = [*compress(volumes, is_known)], scores[:, is_known]
-        ours, theirs = scores[: len(chosen)], scores[len(chosen) :]
-        sign = 1.0 if is_higher_better else -1.0
-        probability = probability_of_improvement(sign * ours, sign * theirs)
-        paired = paired_difference(ours, theirs, [subject_of.get(volume, volume) for volume in volumes])
-        least, most = bounds_in(search, name)
-        n_left_out = len(is_known) - len(volumes)
-        yield Difference(name, is_higher_better, paired.clipped(least - most, most - least), probability, n_left_out)

@@ -13,8 +13,9 @@ from optuna.trial import FrozenTrial, TrialState
 from armscan.reports.html import Row, folded, table, video_address, write_page
 from armscan.sweeps.results.charts import charts_of
 from armscan.sweeps.results.csv_tables import all_numbers, cause_of
+from armscan.sweeps.results.difference import HOW
 from armscan.sweeps.results.final_results import ConfigResult, final_results, final_table
-from armscan.sweeps.results.judgement import HOW, Judgement, judge
+from armscan.sweeps.results.judgement import Judgement, judge
 from armscan.sweeps.results.population_charts import population_charts
 from armscan.sweeps.results.selection import candidates_of, decision_section
 from armscan.sweeps.scheduling.state import StudyState, env_steps_of, is_feasible

@@ -6,7 +6,8 @@ import pytest
 
 from armscan.stats.bootstrap import Estimate
 from armscan.sweeps.results.csv_tables import _difference_rows, _importance_rows, all_numbers
-from armscan.sweeps.results.judgement import Difference, Judgement
+from armscan.sweeps.results.difference import Difference
+from armscan.sweeps.results.judgement import Judgement
 from armscan.sweeps.storage.attribute_names import OBJECTIVES, RETRIED, RETRY_OF
 
 

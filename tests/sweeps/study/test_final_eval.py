@@ -12,11 +12,13 @@ from optuna.trial import TrialState
 from armscan.errors import StudyError
 from armscan.stats.bootstrap import Estimate
 from armscan.stats.paired import paired_difference
-from armscan.sweeps.results import judgement as judgement_module
+from armscan.sweeps.results import difference as difference_module
 from armscan.sweeps.results.csv_tables import _ending_rows
-from armscan.sweeps.results.judgement import COMPARISONS, Difference, Judgement, best_metrics, judge, result_note
+from armscan.sweeps.results.difference import Difference
+from armscan.sweeps.results.judgement import Judgement, judge
 from armscan.sweeps.results.progress import final_line
 from armscan.sweeps.results.selection import candidates_of
+from armscan.sweeps.results.study_run import COMPARISONS, best_metrics, result_note
 from armscan.sweeps.scheduling.limits import Limits
 from armscan.sweeps.scheduling.population import searched_values
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
@@ -528,13 +530,13 @@ def test_configuration_that_is_changed_back_trains_what_the_other_dropped(storag
 
 def test_difference_counts_volumes_of_one_arm_once(storage_uri, monkeypatch):
     given = []
-    monkeypatch.setattr(judgement_module, "subjects_of", lambda _: {"v0": "a", "v1": "a", "v2": "b"})
+    monkeypatch.setattr(difference_module, "subjects_of", lambda _: {"v0": "a", "v1": "a", "v2": "b"})
 
     def recorded(*arguments):
         given.append(arguments[2])
         return paired_difference(*arguments)
 
-    monkeypatch.setattr(judgement_module, "paired_difference", recorded)
+    monkeypatch.setattr(difference_module, "paired_difference", recorded)
     judge(run(storage_uri))
     assert given[0] == ["a", "a", "b"]
 

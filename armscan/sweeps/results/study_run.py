@@ -1,0 +1,75 @@
+"""The result of a study as its run in MLflow shows it: metrics, and a note."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import optuna
+
+from armscan.sweeps.results.difference import HOW
+from armscan.sweeps.results.final_results import final_table
+from armscan.sweeps.results.judgement import Judgement
+from armscan.sweeps.scheduling.state import CONTROL
+from armscan.sweeps.storage.attribute_names import METRICS, OBJECTIVES
+from armscan.sweeps.study.candidates import NOTHING_SEARCHED
+from armscan.sweeps.study.study import best_trials
+from armscan.training.baselines import RANDOM
+from armscan.training.episode_results import TEST_METRICS
+from armscan.training.metric_display import leading_among
+from armscan.training.metrics import ENDS
+from armscan.utils.text import markdown_table
+
+# Prefixes of the metrics of a study's run that compare the chosen configuration with the control.
+COMPARISONS = ("difference", "probability_of_improvement")
+
+
+def best_metrics(search: optuna.Study, judgement: Judgement | None) -> dict[str, float]:
+    """Return the leading metrics of a study's result, by the names that runs use; before it has one, of its best trial.
+
+    Metrics that are not there are NaN, in place of those of an earlier result, which MLflow cannot delete: validation
+    metrics of the control, differences, and intervals.
+
+    Args:
+        search: Study of the search.
+        judgement: Its judgement; None without one.
+    """
+    best = best_trials(search, 1)
+    found = _leading("validation", best[0].user_attrs.get(METRICS, {}) if best else {})
+    if judgement is None or (chosen := judgement.of_chosen) is None:
+        return found
+    found = dict.fromkeys(found, math.nan)
+    if judgement.chosen != CONTROL:
+        trials = search.get_trials(deepcopy=False)
+        found |= _leading("validation", trials[judgement.chosen].user_attrs.get(METRICS, {}))
+    of_chosen = chosen.figures.metrics()
+    found |= _leading(TEST_METRICS, of_chosen)
+    if (of_random := chosen.baselines.get(RANDOM)) is not None:
+        found |= _leading(RANDOM, of_random.metrics())
+    compared = (*(name for name in search.user_attrs[OBJECTIVES] if name in of_chosen), *leading_among(of_chosen))
+    found |= dict.fromkeys((name for key in COMPARISONS for each in compared for name in _names(key, each)), math.nan)
+    for each in judgement.differences:
+        for key, estimate in zip(COMPARISONS, (each.estimate, each.probability), strict=True):
+            found |= dict(zip(_names(key, each.metric), estimate, strict=True))
+    return found
+
+
+def _leading(prefix: str, metrics: Mapping[str, float]) -> dict[str, float]:
+    """Return the leading metrics that are not NaN, by their names in MLflow."""
+    return {f"{prefix}/{name}": metrics[name] for name in leading_among(metrics) if not math.isnan(metrics[name])}
+
+
+def _names(key: str, metric: str) -> list[str]:
+    """Return the names of an estimate and of the ends of its interval."""
+    return [f"{key}/{metric}{end}" for end in ("", *ENDS)]
+
+
+def result_note(judgement: Judgement | None) -> str:
+    """Return the result of a study in Markdown, as the study prints it; empty before a configuration was judged."""
+    if judgement is None or judgement.of_chosen is None:
+        return ""
+    settings = (f"{name}: {f'`{each}`' if each else NOTHING_SEARCHED}" for name, each in judgement.settings.items())
+    parts = [f"**{judgement.result}**", *settings, "The test volumes:", final_table(judgement.results).markdown()]
+    if rows := [each.row() for each in judgement.differences]:
+        parts += [f"{judgement.compared}:", markdown_table([*rows[0]], [[*row.values()] for row in rows]), HOW]
+    return "\n\n".join([*parts, *(f"Note: {note}." for note in judgement.notes)])
