@@ -24,6 +24,7 @@ from armscan.agents import sac_kernels as kernels
 from armscan.agents.adam_vectors import AdamVectors, flattened
 from armscan.agents.compute import Compute
 from armscan.agents.mlp_kernels import Layers
+from armscan.agents.network_modules import is_plain
 from armscan.agents.replay import Replay
 from armscan.utils.compilation import log_compilation
 
@@ -133,9 +134,12 @@ def fallback_reason(algorithm: sac.SAC[Any], compute: Compute, replay: ReplayBuf
     """Return why Tianshou's own update must run; None if the update can be compiled."""
     optimisers: list[Any] = [*algorithm._optimizers]
     entropy = [algorithm.alpha._optim] if isinstance(algorithm.alpha, sac.AutoAlpha) else []
-    sizes = [layer_sizes(network) for network in (algorithm.policy.actor, algorithm.critic, algorithm.critic2)]
+    networks = algorithm.policy.actor, algorithm.critic, algorithm.critic2
+    sizes = [layer_sizes(network) for network in networks]
     if None in sizes or sizes[1] != sizes[2] or type(algorithm.policy) is not sac.SACPolicy:
         return "its networks are not fully connected with ReLU"
+    if not all(parameter.requires_grad for network in networks for parameter in network.parameters()):
+        return "a network has weights that are not trained"
     if type(replay) is not Replay:
         return f"its replay buffer is {type(replay).__name__}"
     if not compute.is_float32_on_cpu:
@@ -144,8 +148,8 @@ def fallback_reason(algorithm: sac.SAC[Any], compute: Compute, replay: ReplayBuf
         return "compute.compile=true"
     if algorithm.n_step_return_horizon != 1:
         return f"its returns look {algorithm.n_step_return_horizon} steps ahead"
-    is_plain = all(_is_plain(each) for each in [*entropy, *(each._optim for each in optimisers)])
-    if not is_plain or algorithm.lr_schedulers or any(each._max_grad_norm is not None for each in optimisers):
+    is_adam = all(_is_plain_adam(each) for each in [*entropy, *(each._optim for each in optimisers)])
+    if not is_adam or algorithm.lr_schedulers or any(each._max_grad_norm is not None for each in optimisers):
         return "its optimisers are not plain Adam"
     return None
 
@@ -158,13 +162,15 @@ def layer_sizes(network: Any) -> list[int] | None:
         n_heads = 1
     else:
         return None
+    if not is_plain(network):
+        return None
     parts = [part for part in network.modules() if not any(True for _ in part.children())]
     n_hidden = (len(parts) - n_heads) // 2
     if [type(part) for part in parts] != [nn.Linear, nn.ReLU] * n_hidden + [nn.Linear] * n_heads:
         return None
     linear = [part for part in parts if isinstance(part, nn.Linear)]
-    is_plain = all(each.bias is not None and each.weight.dtype == torch.float32 for each in linear)
-    if type(network.preprocess) is not Net or network.preprocess.softmax or not is_plain:
+    is_usual = all(each.bias is not None and each.weight.dtype == torch.float32 for each in linear)
+    if type(network.preprocess) is not Net or network.preprocess.softmax or not is_usual:
         return None
     return [linear[0].in_features, *(each.out_features for each in linear[:-n_heads])]
 
@@ -187,7 +193,7 @@ def _flushed_denormals() -> Iterator[None]:
         torch.set_flush_denormal(False)
 
 
-def _is_plain(optimiser: Any) -> bool:
+def _is_plain_adam(optimiser: Any) -> bool:
     group = optimiser.param_groups[0]
     return type(optimiser) is torch.optim.Adam and not (
         len(optimiser.param_groups) > 1 or group["weight_decay"] or group["amsgrad"] or group["maximize"]

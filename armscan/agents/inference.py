@@ -17,6 +17,7 @@ from tianshou.utils.torch_utils import torch_train_mode
 from torch import nn
 
 from armscan.agents.compute import Compute
+from armscan.agents.network_modules import is_plain
 from armscan.agents.policy import batch_of
 from armscan.envs.history import observation_of, parts_of, rows_of
 from armscan.envs.rules import Observed
@@ -105,16 +106,13 @@ class Inference:
 
 def _layers_of(actor: nn.Module) -> list[nn.Module] | None:
     """Return the layers that compute an actor's mean; None if they are not all linear or ReLU."""
-    if type(actor) is not ContinuousActorProbabilistic or type(actor.preprocess) is not Net:
+    if type(actor) is not ContinuousActorProbabilistic or type(actor.preprocess) is not Net or not is_plain(actor):
         return None
     if not actor._unbounded or actor.preprocess.softmax:
         return None
     layers = [*actor.preprocess.model.model, *actor.mu.model]
-    return layers if all(map(_is_plain, layers)) else None
-
-
-def _is_plain(layer: nn.Module) -> bool:
-    return isinstance(layer, nn.ReLU) or (isinstance(layer, nn.Linear) and layer.bias is not None)
+    has_bias = all(layer.bias is not None for layer in layers if isinstance(layer, nn.Linear))
+    return layers if has_bias else None
 
 
 def _forward(layers: Sequence[nn.Module], rows: Rows) -> Rows:

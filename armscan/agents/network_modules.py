@@ -5,9 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 from gymnasium import spaces
-from tianshou.utils.net.common import ModuleWithVectorOutput, Net
+from tianshou.utils.net.common import MLP, ModuleWithVectorOutput, Net
 from tianshou.utils.net.continuous import ContinuousActorProbabilistic as Actor
+from tianshou.utils.net.continuous import ContinuousCritic
 from torch import nn
+
+PLAIN = frozenset({Actor, ContinuousCritic, Net, MLP, nn.Sequential, nn.Linear, nn.ReLU})
+HOOKS = "_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks"
 
 
 def mlp_body(space: spaces.Space[Any], hidden_sizes: list[int], activation: str, n_action: int = 0) -> Net:
@@ -48,3 +52,15 @@ def init_linear(module: nn.Module) -> nn.Module:
             nn.init.orthogonal_(layer.weight, gain=2**0.5)
             nn.init.zeros_(layer.bias)
     return module
+
+
+def is_plain(network: nn.Module) -> bool:
+    """Return whether a network computes just what the types of its modules say: fully connected layers with ReLU.
+
+    Subclasses and hooks, such as those of `spectral_norm`, may compute anything.
+    """
+    parts, parameters = [*network.modules()], network.parameters()
+    is_hooked = any(getattr(part, name) for part in parts for name in HOOKS) or any(
+        each._backward_hooks for each in parameters
+    )
+    return not is_hooked and all(type(part) in PLAIN and "forward" not in vars(part) for part in parts)

@@ -101,6 +101,19 @@ def check_composed(config: Mapping[str, Any], *, where: str) -> None:
         raise UntrustedError(f"{where}: its configuration {found}; {HOW}")
 
 
+def classes_in_groups(choices: Mapping[str, Iterable[object]]) -> set[str]:
+    """Return the names of the classes in the user's own files of these choices, by configuration group."""
+    folders = own_folders().values()
+    files = (folder / group / f"{each}.yaml" for folder in folders for group in choices for each in choices[group])
+    return _classes_in(filter(Path.is_file, files))
+
+
+def foreign_targets(config: Mapping[str, Any]) -> list[str]:
+    """Return the names of the classes and functions in a configuration that are not armscan's."""
+    targets = (str(value) for key, value in _leaves(config) if key.rpartition(".")[2] == TARGET)
+    return [each for each in dict.fromkeys(targets) if each not in offered_classes()]
+
+
 def needs_trust(config: Mapping[str, Any]) -> bool:
     """Return whether a run with this configuration, or these MLflow parameters, can be built only with `--trust`."""
     return _foreign_part(migrate(config), offered_classes()) is not None

@@ -11,11 +11,12 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from armscan.config.compose import compose
-from armscan.config.defaults import CHANGES
-from armscan.errors import CheckpointError, InvalidValueError
+from armscan.config.defaults import CHANGES, to_plain
+from armscan.config.own_code import changed_modules, own_code
+from armscan.errors import CheckpointError, InvalidValueError, few
 from armscan.experiment.build import check_keys, check_sections
 from armscan.tracking.lookup import FoundRun, load_agent_run
-from armscan.tracking.tags import DOMAIN_TAG
+from armscan.tracking.tags import DOMAIN_TAG, OWN_CODE_TAG
 from armscan.training import CheckpointProvenance, Fingerprints, TrainingDomain, load_weights
 
 # Keys of the section `data` that hold paths.
@@ -44,6 +45,13 @@ class EvaluatedAgent:
     n_env_steps: int = 0
     domain: TrainingDomain | None = None
     volumes: Fingerprints | None = field(default=None, repr=False)
+
+    @property
+    def code_note(self) -> str | None:
+        """Note on the code of own classes that has changed since the run; None if none has."""
+        then = self.run.tags.get(OWN_CODE_TAG) if self.run else None
+        changed = changed_modules(then, own_code(to_plain(self.config)))
+        return f"the code of {few(changed)} has changed since the run" if changed else None
 
 
 def agent_of_run(tracking: str, run_id: str, changes: Mapping[str, Any], *, trust: bool = False) -> EvaluatedAgent:

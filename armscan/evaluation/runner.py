@@ -117,7 +117,7 @@ def prepare_agent(
     is_elsewhere = bool(data and source.run)
     known = known_volumes(source, groups) if is_elsewhere else []
     own_groups = [label for label, volumes in groups.items() if is_elsewhere and are_known(source, volumes)]
-    notes += known
+    notes += [*known, *([source.code_note] if source.code_note else [])]
     if source.run and source.volumes is None and own.cache_info().currsize:
         notes.append("the run has no fingerprints of its volumes, so these may have changed since")
     for note in notes:

@@ -15,6 +15,7 @@ from omegaconf import DictConfig
 
 import armscan
 from armscan.config.defaults import CHOICES, to_plain
+from armscan.config.own_code import as_tag, own_code
 from armscan.experiment.build import RunSetup
 from armscan.experiment.job import Invocation
 from armscan.tracking import (
@@ -33,6 +34,7 @@ from armscan.tracking.tags import (
     HOST_TAG,
     JOB_TAG,
     OVERRIDES_TAG,
+    OWN_CODE_TAG,
     SUBJECTS,
     VERSION_TAG,
     VOLUMES,
@@ -100,6 +102,7 @@ def start_tracking(
             **place_tags(invocation.folder),
             "working_folder": str(Path.cwd()),
             **sha256_tags(files),
+            **({OWN_CODE_TAG: as_tag(code)} if (code := own_code(resolved)) else {}),
             **({JOB_TAG: str(job.number)} if job else {}),
             **(tags or {}),
         },

@@ -7,7 +7,8 @@ continues.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,14 +19,15 @@ from pydantic import TypeAdapter, ValidationError
 
 from armscan.agents import Learner
 from armscan.config.defaults import RESUME, TRACKING_URI, default_tracking
+from armscan.config.own_code import changed_modules, own_code
 from armscan.config.trust import TRUST, check_stored_overrides, stored_config
-from armscan.errors import InvalidValueError, ResumeError, UntrustedError, printable
+from armscan.errors import InvalidValueError, ResumeError, UntrustedError, few, printable
 from armscan.experiment.build import set_up
 from armscan.experiment.provenance import place_tags, volume_tags
 from armscan.experiment.runner import run_tracked
 from armscan.tracking import TrackedRun, TrackingStore, check_run_id, check_version, find_run, open_existing_store, sync
 from armscan.tracking.notes import Note
-from armscan.tracking.tags import FOLDER_TAG, GRID_TAG, STUDY_TAG
+from armscan.tracking.tags import FOLDER_TAG, GRID_TAG, OWN_CODE_TAG, STUDY_TAG
 from armscan.training import Fingerprints, check_unchanged, fingerprints_in, resume_from_checkpoint
 from armscan.utils.files import SQLITE_PREFIX, remove_unfinished, sha256, sqlite_file
 from armscan.utils.run_files import (
@@ -68,7 +70,7 @@ def resume(arguments: Sequence[str], repeat_grid: Callable[..., None]) -> None:
     grid = _grid_of(run)
     if not trust:
         _check_grid(run, grid, uri)
-    _enter_working_folder(run)
+    _enter_working_folder(run, trust=trust)
     _check_store(run, grid, client.uri)
     repeat_grid(grid, run.info.run_id, trust=trust)
 
@@ -137,10 +139,11 @@ def resume_run(
         migrated = stored_config(config, where=f"run {run_id}", trust=trust)
         _check_last_checkpoint(run, folder)
         remove_unfinished(folder)
-        _enter_working_folder(run)
+        _enter_working_folder(run, trust=trust)
         print(f"resuming {printable(run.info.run_name)}, run {run_id}", flush=True)
         setup = set_up(OmegaConf.create(migrated))
         _check_volumes(run, folder, setup.fingerprints)
+        check_own_code(run, migrated)
         agent = setup.agent
         earlier = resume_from_checkpoint(agent, folder, setup.provenance(run_id)) if isinstance(agent, Learner) else []
         tags = volume_tags(setup) | place_tags(folder)
@@ -242,9 +245,17 @@ def _check_volumes(run: Run, folder: Path, now: Fingerprints) -> None:
         check_unchanged(then, now, f"run {run.info.run_id} was started with")
 
 
-def _enter_working_folder(run: Run) -> None:
-    """Change to the working folder of the run, where its relative paths begin."""
-    folder = _tag(run, "working_folder")
+def check_own_code(run: Run, config: Mapping[str, Any]) -> None:
+    """Raise `ResumeError` if a run would continue with other code of the user's own classes."""
+    if changed := changed_modules(run.data.tags.get(OWN_CODE_TAG), own_code(config)):
+        raise ResumeError(
+            f"run {run.info.run_id} was started with other code of {few(changed)}: put it back, or start another run"
+        )
+
+
+def _enter_working_folder(run: Run, *, trust: bool) -> None:
+    """Change to the working folder of the run, where its relative paths begin and, if trusted, its own classes are."""
+    folder, left = _tag(run, "working_folder"), str(Path.cwd())
     try:
         os.chdir(folder)
     # ValueError: the path has characters that no path can have.
@@ -254,3 +265,5 @@ def _enter_working_folder(run: Run) -> None:
             f"run {run.info.run_id} was started in {folder}, where its relative paths begin, but that folder cannot be "
             f"entered ({reason})"
         ) from error
+    if trust:
+        sys.path[:] = [folder if each == left else each for each in sys.path]

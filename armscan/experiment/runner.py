@@ -34,11 +34,12 @@ from armscan.training.episode_seeds import VALIDATION_SEED, VIDEO_SEED
 from armscan.training.progress import progress_reporter
 from armscan.utils.compilation import log_compilation
 from armscan.utils.console import print_sentence
-from armscan.utils.files import named_if_full
+from armscan.utils.files import named_if_full, sha256
 from armscan.utils.processes import no_garbage_collection
 from armscan.utils.run_files import (
     LAST_CHECKPOINT,
     LEARNING_CURVE_FILE,
+    RESULT_SHA256_TAGS,
     RESULTS_PAGE,
     VIDEO_FILE,
     check_free,
@@ -217,6 +218,8 @@ def keep_results(tracked: TrackedRun, result: TrainingResult | None, reached: Ru
     if result:
         draw_learning_curve(result.reports, folder / LEARNING_CURVE_FILE, title=tracked.name)
     reached.write(folder, title=tracked.name)
+    files = {tag: folder / name for name, tag in RESULT_SHA256_TAGS.items()}
+    tracked.set_tags({tag: sha256(file.read_bytes()) for tag, file in files.items() if file.exists()})
     tracked.log_results(folder)
 
 

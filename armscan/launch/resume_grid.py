@@ -22,7 +22,7 @@ from armscan.experiment.build import check_keys, set_up
 from armscan.experiment.job import Invocation, Job
 from armscan.experiment.provenance import provenance_files, sha256_tags
 from armscan.experiment.results import LAST_VALIDATION, figures_of
-from armscan.experiment.resume import resume_run
+from armscan.experiment.resume import check_own_code, resume_run
 from armscan.experiment.runner import run_experiment
 from armscan.tracking import TrackingStore, load_run, open_store, sync
 from armscan.tracking.sanitize import params_of
@@ -47,6 +47,8 @@ def run_again(config: DictConfig, invocation: Invocation, job: Job) -> Metrics:
     earlier = earlier_runs(client, experiment_id, sha256_tags(provenance_files(resolved, setup)), job)
     if not any(run.data.tags.get(PARENT_TAG) == job.repeats for run in earlier):
         _check_volumes(client, experiment_id, params_of(resolved), setup.fingerprints, job)
+    for run in earlier:
+        check_own_code(run, resolved)
     for run in earlier:
         if run.info.status == "FINISHED":
             print(f"[{job.label}] has finished before: run {run.info.run_id}", flush=True)

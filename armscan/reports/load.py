@@ -25,7 +25,15 @@ from armscan.training.fingerprints import Fingerprints, fingerprints_in
 from armscan.training.metric_display import title_of
 from armscan.utils.arrays import FloatArray
 from armscan.utils.files import sha256
-from armscan.utils.run_files import BASELINES_FILE, EVALUATION_FILE, ID_CHARS, SHA256_TAGS, VIDEO_FILE, VOLUMES_FILE
+from armscan.utils.run_files import (
+    BASELINES_FILE,
+    EVALUATION_FILE,
+    ID_CHARS,
+    RESULT_SHA256_TAGS,
+    SHA256_TAGS,
+    VIDEO_FILE,
+    VOLUMES_FILE,
+)
 
 WALL = "wall_s"
 OF_VALIDATION = "validation/"
@@ -35,6 +43,7 @@ OF_THE_TRAINING = ("update/", "train/return", "train/length", "speed/")
 # MLflow's value of a parameter that is not set.
 UNSET = "None"
 T = TypeVar("T")
+SUMS = SHA256_TAGS | RESULT_SHA256_TAGS
 
 
 @dataclass(frozen=True)
@@ -227,7 +236,7 @@ def _parsed(run: Run, files: Mapping[str, bytes], name: str, read: Callable[[Any
     if (contents := files.get(name)) is None:
         return None
     damaged = TrackingError(f"run {run.info.run_id}: its {name} is damaged; put it back, or leave the run out")
-    if run.data.tags.get(SHA256_TAGS.get(name, ""), digest := sha256(contents)) != digest:
+    if run.data.tags.get(SUMS.get(name, ""), digest := sha256(contents)) != digest:
         raise damaged
     try:
         return read(json.loads(contents))

@@ -25,6 +25,7 @@ from armscan.tracking.run import MODEL_FILE
 from armscan.tracking.store import store_errors
 from armscan.tracking.tracking_store import reason_in
 from armscan.training import TEST, TrainingDomain
+from armscan.utils.console import print_sentence
 from armscan.utils.run_files import POLICY_FOLDER
 
 MAX_NAME_CHARS = 256
@@ -50,6 +51,8 @@ def export_policy(tracking: str, run_id: str, folder: Path, *, trust: bool = Fal
     """
     source = agent_of_run(tracking, run_id, {}, trust=trust)
     assert source.run is not None
+    if source.code_note:
+        print_sentence(f"note: {source.code_note}")
     source.config.compute.update(PLAIN_COMPUTE)
     is_sampling = not source.config.agent.get("deterministic_eval", True)
     if is_sampling:

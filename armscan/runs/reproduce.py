@@ -12,8 +12,9 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from armscan.config.command_hints import armscan_command
-from armscan.config.defaults import CHOICES
-from armscan.errors import InvalidValueError, TrackingError
+from armscan.config.defaults import CHOICES, to_plain
+from armscan.config.own_code import changed_modules, own_code
+from armscan.errors import InvalidValueError, TrackingError, few
 from armscan.evaluation.agent_source import from_its_folder
 from armscan.experiment.build import RunSetup, set_up
 from armscan.experiment.job import Invocation, remove_if_untracked
@@ -24,7 +25,7 @@ from armscan.tracking import FoundRun, code_state, environment_tags, load_agent_
 from armscan.tracking.environment import CONSTRAINTS_SUM, REPORTED_PACKAGES, environment
 from armscan.tracking.git import COMMIT, DIFF_SUM, DIRTY
 from armscan.tracking.sync import ENDED
-from armscan.tracking.tags import CHOICE, OVERRIDES_TAG
+from armscan.tracking.tags import CHOICE, OVERRIDES_TAG, OWN_CODE_TAG
 from armscan.training import check_unchanged
 from armscan.utils.run_files import DIFF_FILE, ENVIRONMENT_FILE, REPRODUCTION_FILE, folder_lock
 
@@ -100,6 +101,8 @@ def differences(original: Original) -> list[str]:
             f"; its {DIFF_FILE} is among its artifacts" if DIFF_SUM in tags and DIFF_FILE in original.run.files else ""
         )
         lines.append(f"changes since the commit {_changes(tags)}, and {_changes(now)} now{kept}")
+    if modules := changed_modules(tags.get(OWN_CODE_TAG), own_code(to_plain(original.config))):
+        lines.append(f"the code of {few(modules)} has changed since")
     if "resumed" in tags:
         lines.append(f"the run was cut off and resumed (times: {tags['resumed']}), which changes no figure by itself")
     if original.environment is None:
@@ -124,8 +127,8 @@ def not_compared(original: Original) -> list[str]:
     lines = []
     if "unknown" in (original.run.tags.get(COMMIT), code_state().tags.get(COMMIT)):
         lines.append("the code of armscan, which did not run from a git repository then or does not now")
-    if original.run.needs_trust:
-        lines.append("the code of classes that are not armscan's, which runs do not keep")
+    if original.run.needs_trust and OWN_CODE_TAG not in original.run.tags:
+        lines.append("the code of classes that are not armscan's, of which the run has no checksums")
     return lines
 
 

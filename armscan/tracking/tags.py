@@ -16,6 +16,8 @@ AGENT_TAG, OBS_TAG = f"{CHOICE}agent", f"{CHOICE}obs"
 VOLUMES, SUBJECTS = "volumes.", "subjects."
 # What the agent of a run was trained on, as `armscan.training.TrainingDomain` writes it.
 DOMAIN_TAG = "trained_on"
+# Checksums of the modules of the user's own classes, by their names.
+OWN_CODE_TAG = "own_code"
 # The run that was evaluated; only evaluations have this tag.
 EVALUATED_TAG = "evaluation.of"
 # Why a run failed or was interrupted.

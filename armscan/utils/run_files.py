@@ -38,6 +38,8 @@ RESULTS = (
 )
 # Tags of a run with the SHA-256 of what it was started with.
 SHA256_TAGS = {CONFIG_FILE: "config.sha256", VOLUMES_FILE: "volumes.sha256"}
+# Tags of a run with the SHA-256 of its results.
+RESULT_SHA256_TAGS = {EVALUATION_FILE: "evaluation.sha256", BASELINES_FILE: "baselines.sha256"}
 LOCK_FILE = ".lock"
 # The folder of a run's outbox, in the run's folder.
 OUTBOX_FOLDER = "tracking"

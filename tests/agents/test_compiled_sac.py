@@ -15,7 +15,7 @@ from tianshou.data import Batch, PrioritizedVectorReplayBuffer
 from tianshou.utils.torch_utils import policy_within_training_step
 
 from armscan.agents import MLP, SAC, Compute, Multimodal
-from armscan.agents.compiled_sac import N_AT_ONCE, CompiledSAC
+from armscan.agents.compiled_sac import N_AT_ONCE, CompiledSAC, fallback_reason
 from armscan.agents.replay import Replay
 from tests.agents.conftest import ENV_FACTORIES, SMALL_SAC, setup_for
 from tests.support.programs import output_of
@@ -271,6 +271,21 @@ def test_weights_that_are_not_finite_are_not_hidden():
 def test_anything_else_is_left_to_tianshou(changes, reason):
     ours = compiled(filled_replay(5, 2), **changes)
     assert ours.fallback_reason == reason
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda layer: layer.requires_grad_(requires_grad=False), "a network has weights that are not trained"),
+        (lambda layer: layer.register_forward_hook(lambda *_: None), "its networks are not fully connected with ReLU"),
+        (lambda layer: layer.weight.register_hook(lambda _: None), "its networks are not fully connected with ReLU"),
+    ],
+)
+def test_networks_with_frozen_weights_or_hooks_are_left_to_tianshou(change, reason):
+    replay = filled_replay(5, 2)
+    ours = compiled(replay)
+    change(ours.policy.actor.preprocess.model.model[0])
+    assert fallback_reason(ours, Compute("cpu"), replay) == reason
 
 
 def test_other_replay_buffers_are_left_to_tianshou():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from tianshou.utils.net.common import Net
+from tianshou.utils.net.common import MLP, Net
 from tianshou.utils.net.continuous import ContinuousActorProbabilistic
 from torch import nn
 
@@ -19,7 +19,41 @@ class Dropout(Net):
         self.model.model.append(nn.Dropout())
 
 
+class Standardised(nn.Linear):
+    """A linear layer whose weights have the mean 0."""
+
+    def forward(self, inputs):
+        return nn.functional.linear(inputs, self.weight - self.weight.mean(), self.bias)
+
+
+class Residual(MLP):
+    """Layers whose output is added to their first one's."""
+
+    def forward(self, observations):
+        first = self.model[0](torch.as_tensor(observations))
+        return first + self.model[1:](first)
+
+
+def residual():
+    net = Net(state_shape=(3,), hidden_sizes=[16, 16])
+    net.model = Residual(input_dim=3, hidden_sizes=[16, 16])
+    return net
+
+
+def hooked():
+    net = Net(state_shape=(3,), hidden_sizes=[16])
+    net.model.register_forward_pre_hook(lambda _, inputs: (torch.as_tensor(inputs[0]).clamp(-0.1, 0.1),))
+    return net
+
+
 NETWORKS = {
+    "own layer": lambda: (Net(state_shape=(3,), hidden_sizes=[16], linear_layer=Standardised), True),
+    "own layers": lambda: (residual(), True),
+    "hook": lambda: (hooked(), True),
+    "spectral norm": lambda: (
+        Net(state_shape=(3,), hidden_sizes=[16], linear_layer=lambda n, m: nn.utils.spectral_norm(nn.Linear(n, m))),
+        True,
+    ),
     "plain": lambda: (Net(state_shape=(3,), hidden_sizes=[16]), True),
     "bounded by tanh": lambda: (Net(state_shape=(3,), hidden_sizes=[16]), False),
     "softmax": lambda: (Net(state_shape=(3,), hidden_sizes=[16], action_shape=(16,), softmax=True), True),

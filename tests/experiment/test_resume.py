@@ -405,3 +405,39 @@ def test_resume_refuses_other_volumes_where_there_is_no_checkpoint(answer, tmp_p
     line = f"volumes are not those that run {run.info.run_id} was started with: "
     assert line in refused(answer, word)
     assert client.get_run(run.info.run_id).info.status == "KILLED"
+
+
+PARTS = """
+import numpy as np
+from gymnasium import spaces
+
+SCALE = 100
+
+
+class Nerve:
+    def spaces(self, geometries, n_action):
+        return {"nerve": spaces.Box(0.0, np.inf, (1,), np.float32)}
+
+    def observe(self, view):
+        return {"nerve": np.array([(view.slice_xz == 4).sum() / SCALE], dtype=np.float32)}
+"""
+
+
+def test_own_class_is_that_of_the_runs_folder_and_must_be_unchanged(tmp_path):
+    own, elsewhere = tmp_path / "own", tmp_path / "elsewhere"
+    for folder, text in ((own, PARTS), (elsewhere, PARTS.replace("100", "7"))):
+        folder.mkdir()
+        (folder / "parts_of_a_run.py").write_text(text)
+    (own / "conf" / "obs").mkdir(parents=True)
+    (own / "conf" / "obs" / "nerve.yaml").write_text("_target_: parts_of_a_run.Nerve\n")
+    killed(lambda printed: "training for at most" in printed, *LONGER, "obs=nerve", cwd=own)
+    (run,) = runs_in(own)[1]
+    run_id = run.info.run_id
+    again = ["resume=" + run_id, "--trust", f"tracking.uri=sqlite:///{own}/mlruns.db"]
+    (own / "parts_of_a_run.py").write_text(PARTS.replace("100", "7"))
+    refused = armscan_run(*again, cwd=elsewhere)
+    assert refused.returncode == 2
+    line = f"error: run {run_id} was started with other code of parts_of_a_run: put it back, or start another run"
+    assert line in refused.stderr
+    (own / "parts_of_a_run.py").write_text(PARTS)
+    assert armscan_run(*again, cwd=elsewhere).returncode == 0

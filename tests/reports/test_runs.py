@@ -160,8 +160,9 @@ def without_test(text):
         lambda text: text.replace('"n_steps"', '"steps"'),
         lambda text: text.replace('"n_steps": ', '"n_steps": "many", "of": '),
         lambda text: text.replace('"distance_mm": ', '"distance_mm": NaN, "of": '),
+        lambda text: text.replace('"n_steps": ', '"n_steps": 1'),
     ],
-    ids=["torn", "list", "split", "field", "word", "nan"],
+    ids=["torn", "list", "split", "field", "word", "nan", "another run's"],
 )
 def test_a_damaged_evaluation_is_refused_in_one_line(answer, artifacts, tmp_path, damage):
     file = artifacts / "evaluation.json"

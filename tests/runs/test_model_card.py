@@ -10,7 +10,10 @@ from armscan.evaluation import EvaluationReport
 from armscan.runs.model_card import MAX_CHARS, Card
 from armscan.tracking import TrackedRun, load_run
 from armscan.tracking.tags import EVALUATED_TAG
+from armscan.utils.files import sha256
+from armscan.utils.run_files import RESULT_SHA256_TAGS
 from tests.support.stores import store_in
+from tests.support.tracked_runs import store_of
 from tests.training.test_train import evaluation_of
 
 OWN = {"test volumes": evaluation_of(2, 4).to_dict()}
@@ -50,6 +53,13 @@ def test_card_has_the_latest_evaluation_that_has_kept_its_figures(keep, tmp_path
     assert "| steps, mean | 3.00 (2.00–4.00) |" in card.text
     # The tags are of the run's own evaluation, by its own rules.
     assert card.tags["test_volumes/mean_steps"] == "3"
+
+
+def test_evaluation_of_another_run_is_refused(keep, tmp_path):
+    run_id = keep("evaluation.json", json.dumps(OWN))
+    store_of(tmp_path).set_tag(run_id, RESULT_SHA256_TAGS["evaluation.json"], sha256(b"another"))
+    with pytest.raises(TrackingError, match=r"its evaluation\.json is damaged"):
+        card_of(run_id, tmp_path)
 
 
 @pytest.mark.parametrize(("n_notes", "is_there"), [(2, True), (20, False)])

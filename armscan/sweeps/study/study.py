@@ -16,6 +16,8 @@ from optuna.trial import FrozenTrial, TrialState
 
 from armscan.config.defaults import ADDED, NOT_COMPARED, to_plain
 from armscan.config.legacy import migrate, renamed
+from armscan.config.own_code import own_code
+from armscan.config.trust import classes_in_groups
 from armscan.errors import StudyError
 from armscan.sweeps.scheduling.population import searched_values
 from armscan.sweeps.scheduling.state import is_feasible
@@ -38,9 +40,10 @@ from armscan.tracking import flatten
 
 N_SHOWN = 5
 CONSTRAINTS = "study.constraints"
-# Among the compared settings: the size and interval of a population, the overrides below a searched group, and a
-# checksum of the volumes. A study that lacks one, as those of earlier versions do, is not compared by it.
-LATER = POPULATION, OVERRIDES, VOLUMES = "study.population", "study.overrides", "study.volumes"
+# Among the compared settings: the size and interval of a population, the overrides below a searched group, and
+# checksums of the volumes and of the modules of own classes. A study that lacks one, as those of earlier versions do,
+# is not compared by it.
+LATER = POPULATION, OVERRIDES, VOLUMES, CODE = "study.population", "study.overrides", "study.volumes", "study.code"
 
 
 def make_study(storage: Storage, settings: StudySettings, fixed: Mapping[str, Any]) -> optuna.Study:
@@ -158,6 +161,11 @@ def comparable_settings(settings: StudySettings, fixed: Mapping[str, Any]) -> di
     ]
     if not any(f"{name}.".startswith("data.") for name in names):
         of_trials |= {f"{VOLUMES}.{part}": volumes for part, volumes in given.get("volumes", {}).items()}
+    code = own_code(
+        {**fixed, "task": settings.task},
+        classes_in_groups({each.name: each.extremes for each in settings.space.parameters}),
+    )
+    of_trials |= {f"{CODE}.{module}": checksum for module, checksum in code.items()}
     left_out = (*not_compared, *searched, f"{STUDY}.")
     shared = {key: value for key, value in flatten(fixed).items() if not f"{key}.".startswith(left_out)}
     shared = {key: value for key, value in shared.items() if key not in ADDED or value is not None}

@@ -1,6 +1,8 @@
 """A study in its storage: the same one is resumed, another is refused with what differs."""
 
+import importlib
 import re
+import sys
 
 import optuna
 import pytest
@@ -138,6 +140,27 @@ def test_study_that_was_made_before_they_were_compared_goes_on(storage_uri, is_p
         # Its trials show that it is none.
         with pytest.raises(StudyError, match=re.escape("study.population was None, is [4, 100]")):
             make_study(storage, settings(**PBT), now)
+
+
+@pytest.mark.parametrize("is_searched", [False, True])
+def test_study_whose_own_code_has_changed_is_refused(storage_uri, tmp_path, monkeypatch, is_searched):
+    folder = tmp_path / "here"
+    (folder / "conf" / "agent").mkdir(parents=True)
+    (folder / "conf" / "agent" / "own.yaml").write_text("_target_: parts_of_a_study.Own\n")
+    monkeypatch.chdir(folder)
+    monkeypatch.syspath_prepend(str(folder))
+    fixed = FIXED if is_searched else FIXED | {"agent": {"_target_": "parts_of_a_study.Own"}}
+    asked = {"space": Space.read({"agent": {"choices": ["own", "sac"]}})} if is_searched else {}
+
+    def opened(text):
+        (folder / "parts_of_a_study.py").write_text(text)
+        monkeypatch.delitem(sys.modules, "parts_of_a_study", raising=False)
+        importlib.invalidate_caches()
+        return make_study(open_storage(storage_uri), settings(**asked), fixed)
+
+    opened("class Own:\n    pass\n").tell(opened("class Own:\n    pass\n").ask(), 1.0)
+    with pytest.raises(StudyError, match=r"another configuration: study\.code\.parts_of_a_study was \w+, is \w+;"):
+        opened("class Own:\n    scale = 1\n")
 
 
 def test_study_with_its_objectives_in_another_order_is_refused(storage_uri):

@@ -1,0 +1,107 @@
+"""Checksums of the code of the user's own classes: when it changes, the configuration stays the same."""
+
+from __future__ import annotations
+
+import ast
+import functools
+import importlib.util
+import sys
+import sysconfig
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from hydra.utils import get_object
+
+from armscan.config.trust import foreign_targets
+from armscan.utils.files import sha256
+
+N_CHARS = 16
+FUNCTIONS = ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda
+INSTALLED = tuple(Path(path) for name, path in sysconfig.get_paths().items() if name.endswith(("lib", "stdlib")))
+
+
+def own_code(config: Mapping[str, Any], further: Iterable[str] = ()) -> dict[str, str]:
+    """Return a checksum of each module that the own classes of a configuration are from, and of those it imports.
+
+    Installed packages are left out, because a run keeps their versions, and so are imports within functions.
+
+    Args:
+        config: Resolved configuration. What it names but cannot be imported is left out.
+        further: Names of further classes. Default: none.
+    """
+    sums: dict[str, str] = {}
+    names = [name for target in (*foreign_targets(config), *further) for name in _modules_of(target)]
+    while names:
+        name = names.pop()
+        module = sys.modules.get(name)
+        if name not in sums and module is not None and (file := _own_file(module)) is not None:
+            sums[name], imported = _read(module, file)
+            names += imported
+    return dict(sorted(sums.items()))
+
+
+def changed_modules(before: str | None, now: Mapping[str, str]) -> list[str]:
+    """Return the names of modules whose code has changed, or that only one of both has.
+
+    Args:
+        before: Checksums as `as_tag` wrote them; None if a run has none: then nothing is known.
+        now: Checksums of today's code.
+    """
+    if before is None:
+        return []
+    then = dict(each.rpartition(":")[::2] for each in before.split())
+    return sorted(name for name in then.keys() | now.keys() if then.get(name) != now.get(name))
+
+
+def as_tag(sums: Mapping[str, str]) -> str:
+    """Return checksums as the text of a tag."""
+    return " ".join(f"{name}:{each}" for name, each in sums.items())
+
+
+def _modules_of(target: str) -> Iterator[str]:
+    """Yield the module of a class, once it is imported."""
+    # What cannot be imported is reported where it is built.
+    try:
+        module = getattr(get_object(target), "__module__", None)
+    except Exception:
+        return
+    if isinstance(module, str):
+        yield from _with_parents(module)
+
+
+def _with_parents(name: str) -> Iterator[str]:
+    parts = name.split(".")
+    yield from (".".join(parts[: n + 1]) for n in range(len(parts)))
+
+
+def _own_file(module: ModuleType) -> Path | None:
+    """Return the source file of a module; None if it is armscan's, or installed."""
+    file = getattr(module, "__file__", None)
+    if not file or not file.endswith(".py") or module.__name__.partition(".")[0] == "armscan":
+        return None
+    path = Path(file)
+    return None if any(path.is_relative_to(folder) for folder in INSTALLED) else path
+
+
+@functools.cache
+def _read(module: ModuleType, file: Path) -> tuple[str, tuple[str, ...]]:
+    """Return a checksum of a module, and the names of what it imports; read once, because loaded code stays."""
+    source = file.read_bytes()
+    return sha256(source)[:N_CHARS], tuple(_imported(module, source))
+
+
+def _imported(module: ModuleType, source: bytes) -> Iterator[str]:
+    nodes: list[ast.AST] = [ast.parse(source)]
+    while nodes:
+        node = nodes.pop()
+        if isinstance(node, ast.Import):
+            for each in node.names:
+                yield from _with_parents(each.name)
+        elif isinstance(node, ast.ImportFrom):
+            base = importlib.util.resolve_name("." * node.level + (node.module or ""), module.__package__)
+            yield from _with_parents(base)
+            yield from (f"{base}.{each.name}" for each in node.names)
+        elif not isinstance(node, FUNCTIONS):
+            nodes += ast.iter_child_nodes(node)
