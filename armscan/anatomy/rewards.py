@@ -69,11 +69,11 @@ class LandmarkReward:
 class AgreementReward(LandmarkReward):
     """The mean of the published reward and the agreement of sizes and positions with the labelled planes.
 
-    The published reward can be 0 as far as 10 mm or 15 degrees from a labelled plane. The agreement rates seven
-    features of a slice: the clustered area of each tissue, and how far the mean centres of tendons and artery are from
-    the bones', across and in depth. A feature costs nothing inside the range that the labelled planes of the training
-    volumes span; outside, its cost rises to at most 1. A distance costs 1 if a tissue is absent. The agreement is minus
-    the mean cost: 0 on each of these planes.
+    With free rotations, the published reward can be 0 more than 15 mm or 50 degrees from a labelled plane. The
+    agreement rates seven features of a slice: the clustered area of each tissue, and how far the mean centres of
+    tendons and artery are from the bones', across and in depth. A feature costs nothing inside the range that the
+    labelled planes of the training volumes span; outside, its cost rises to at most 1. A distance costs 1 if a tissue
+    is absent. The agreement is minus the mean cost: 0 on each of these planes.
 
     Distances are unsigned and between tissues, so that they are the same for left and right hands, and do not change
     when the slice is shifted.

@@ -47,7 +47,7 @@ SELECTION = (
     click.option("--since", type=Moment(), help="Only runs started then or later: 90m, 12h, 7d, 4w or 2026-01-31."),
     click.option("--before", type=Moment(), help="Only runs started before then."),
     click.option("--where", metavar="FILTER", help="Only runs that match this MLflow filter string."),
-    click.option("--parent", metavar="RUN", help="Only children of this grid, study or evaluated run."),
+    click.option("--parent", metavar="RUN", help="Only runs below this grid, study or evaluated run."),
     click.option(
         "--sort",
         type=click.Choice([f"{sign}{key}" for key in SORTS for sign in ("", "-")]),

@@ -52,7 +52,7 @@ def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 
 
 def slice_panel(view: View, max_size: Size) -> Image.Image:
-    """Draw a slice, high z up: each cluster outlined, numbered, and in a shade of its tissue's colour.
+    """Draw a slice, high z up: each cluster outlined, numbered, and filled with a shade of its tissue's colour.
 
     Pixels of a landmark that belong to no cluster are darker.
 

@@ -230,11 +230,13 @@ def _close_parent(
         # `sync` has closed the runs whose processes could not.
         if child.info.status == "RUNNING" or child.data.tags.get(FAILURE_TAG) == PROCESS_DIED:
             outcome = outcomes.get(child.data.tags[JOB_TAG])
-            is_killed = outcome is not None and outcome.failure == INTERRUPTED
-            store.set_tag(child.info.run_id, FAILURE_TAG, INTERRUPTED if is_killed else NO_OUTCOME)
+            reason = (outcome.failure if outcome is not None else None) or NO_OUTCOME
+            is_killed = reason == INTERRUPTED
+            store.set_tag(child.info.run_id, FAILURE_TAG, reason)
             store.set_terminated(child.info.run_id, "KILLED" if is_killed else "FAILED")
     if not children:
         store.delete_run(parent["run_id"])
     else:
-        log_best(store, parent["run_id"], children)
+        done = {number for number, outcome in outcomes.items() if outcome.failure is None}
+        log_best(store, parent["run_id"], [child for child in children if child.data.tags[JOB_TAG] in done])
     return store, sorted(children, key=lambda child: int(child.data.tags[JOB_TAG]))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection
+from collections import defaultdict
+from collections.abc import Collection, Sequence
 from datetime import datetime
 
 from mlflow.entities import Run
@@ -53,8 +54,7 @@ def find_runs(
         if moment is not None
     ]
     conditions += [where] if where else []
-    if parent is not None:
-        conditions.append(f"tags.`{PARENT_TAG}` = '{find_run(client, parent).info.run_id}'")
+    below = None if parent is None else _below(client.runs(experiments), find_run(client, parent).info.run_id)
     try:
         runs = client.runs(experiments, " and ".join(conditions))
     except MlflowException as error:
@@ -69,7 +69,19 @@ def find_runs(
         allowed = (status, agent, obs, projections)
         return all(not some or value in some for value, some in zip(values, allowed, strict=True))
 
-    return [run for run in runs if is_fit(run)]
+    return [run for run in runs if is_fit(run) and (below is None or run.info.run_id in below)]
+
+
+def _below(runs: Sequence[Run], parent_id: str) -> set[str]:
+    """Return the IDs of all runs below a run, such as the trials of a study and their trainings."""
+    children: dict[str, list[str]] = defaultdict(list)
+    for run in runs:
+        children[run.data.tags.get(PARENT_TAG, "")].append(run.info.run_id)
+    found, level = set(), [parent_id]
+    while level:
+        level = [child for each in level for child in children[each] if child not in found]
+        found.update(level)
+    return found
 
 
 def projection_of(run: Run) -> str | None:

@@ -19,4 +19,4 @@ def test_study_outlives_a_killed_worker_and_judges_its_best(start):
     assert len(selected) == 4
     assert len(judged) in (2, 4)
     printed = study.printed.read_text()
-    assert ("No setting beat the default configuration" in printed) == (len(judged) == 2)
+    assert ("No setting beat the control" in printed) == (len(judged) == 2)

@@ -9,6 +9,7 @@ import pytest
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Quote, QuotedString
+from mlflow.entities import Metric
 
 from armscan import run
 from armscan.config.error_messages import one_line_message
@@ -17,7 +18,7 @@ from armscan.experiment.job import INTERRUPTED, OUTCOME_FOLDER, PARENT_FILE, Job
 from armscan.launch.grid_jobs import shared_overrides
 from armscan.launch.multirun import Multirun, end_grid
 from armscan.tracking import begin_outbox, sync
-from armscan.tracking.tags import FOLDER_TAG, JOB_TAG, PARENT_TAG
+from armscan.tracking.tags import BEST_TAG, FOLDER_TAG, JOB_TAG, PARENT_TAG
 from armscan.utils.processes import ProcessInfo
 from tests.support.stores import store_in
 
@@ -71,10 +72,14 @@ def test_job_that_was_stopped_alone_has_not_failed(tmp_path, database, monkeypat
         tags = {JOB_TAG: str(number), FOLDER_TAG: str(tmp_path / str(number)), PARENT_TAG: parent}
         jobs.append(store.create_run(experiment_id, name="job", tags=tags).info.run_id)
     store.set_terminated(jobs[1], "FINISHED")
+    # It was stopped after its evaluation: its table shows no result.
+    for job, rate in zip(jobs, (0.9, 0.4), strict=True):
+        store.log_batch(job, metrics=[Metric("test_volumes/on_plane_5mm_10deg", rate, 1, 0)])
     monkeypatch.setattr(Multirun, "folder", tmp_path)
     assert end_grid() == 1
     assert [store.get_run(run_id).info.status for run_id in (*jobs, parent)] == ["KILLED", "FINISHED", "KILLED"]
     assert "failed" not in capsys.readouterr().err
+    assert store.get_run(parent).data.tags[BEST_TAG] == jobs[1]
 
 
 def test_run_of_a_grid_whose_launcher_has_died_is_closed(tmp_path, database, monkeypatch):

@@ -111,6 +111,7 @@ def test_children_are_folded_into_their_parent_and_unfolded_where_that_is_asked_
     assert listed() == ["multirun", "alone"]
     assert listed("--children") == ["multirun", "job0", "evaluation", "job1", "alone"]
     assert listed(f"--parent={parent_id[:8]}") == ["job1", "job0"]
+    assert listed(f"--parent={parent_id[:8]}", "--children") == ["job1", "job0", "evaluation"]
     # If their parent is not selected, children stand by themselves.
     assert listed("--where=attributes.run_name LIKE 'job%'") == ["job1", "job0"]
     rows = json.loads(answer("list", "--format=json")[1])

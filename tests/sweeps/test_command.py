@@ -239,6 +239,31 @@ def test_run_of_a_study_is_running_while_one_of_two_commands_works_and_killed_on
     assert reason.startswith("stopped at ")
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("database")
+def test_study_whose_worker_left_is_not_finished_and_a_finished_one_stays_as_it_is(tmp_path):
+    words = [*TINY, "study.n_trials=3", "study.workers=1", "study.final_eval.top_k=0", "training.env_steps=3000"]
+
+    def of_study():
+        (run,) = [run for run in runs_in(tmp_path)[1] if run.info.run_name == "study sac_y"]
+        return run
+
+    process = start_run(*words, cwd=tmp_path)
+    wait_until(lambda: len(trials_of(tmp_path)) == 2, process=process)
+    os.kill(workers_in(tmp_path)[0], signal.SIGTERM)
+    assert process.wait(HANG_S) == os.EX_TEMPFAIL
+    assert (of_study().info.status, of_study().data.tags["failure"]) == (
+        "KILLED",
+        "its workers have ended; the same command resumes it",
+    )
+    assert start_run(*words, cwd=tmp_path).wait(HANG_S) == 0
+    finished = of_study()
+    assert finished.info.status == "FINISHED"
+    assert start_run(*words, cwd=tmp_path).wait(HANG_S) == 0
+    assert "nothing is left to do" in (tmp_path / "printed").read_text()
+    assert of_study().to_dictionary() == finished.to_dictionary()
+
+
 @pytest.mark.full
 def test_interrupted_study_kills_a_worker_that_does_not_leave_and_enqueues_its_trial_again(tmp_path):
     words = [*TINY, "study.n_trials=2", "study.final_eval.top_k=0", "training.env_steps=200000"]

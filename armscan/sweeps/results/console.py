@@ -114,8 +114,10 @@ def _print_final_results(opened: OpenedStudy, final: FinalEvaluation) -> int:
     judgement = judge(final)
     if judgement is None or judgement.of_chosen is None:
         nothing = "final training has finished" if candidates else "trial is complete and keeps all constraints"
+        if judgement is not None:
+            nothing = "training of the chosen configuration on the test volumes has finished"
         code, reason = 1, f"no {nothing}"
-        if not final.has_begun_all:
+        if not final.has_begun_all or final.n_unjudged:
             code, reason = unfinished, "trainings are missing; the same command resumes the study"
         print(f"error: no final evaluation, because {reason}", file=sys.stderr)
         return code

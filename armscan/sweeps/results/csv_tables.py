@@ -80,7 +80,8 @@ def all_numbers(
 
 def cause_of(trial: FrozenTrial) -> str:
     """Return why a trial has failed."""
-    return str(trial.user_attrs.get(FAILURE, "not known"))
+    cause = str(trial.user_attrs.get(FAILURE, "not known"))
+    return f"{cause}, retried" if was_retried(trial) else cause
 
 
 def _trial_row(trial: FrozenTrial, objectives: Sequence[str]) -> Row:
@@ -89,6 +90,7 @@ def _trial_row(trial: FrozenTrial, objectives: Sequence[str]) -> Row:
     return {
         "trial": trial.number,
         "state": trial.state.name.lower(),
+        "retried": was_retried(trial),
         **values,
         **({"feasible": is_feasible(trial)} if trial.constraints else {}),
         "seconds": seconds_of(trial),
@@ -109,7 +111,7 @@ def _ending_rows(trials: Sequence[FrozenTrial]) -> list[Row]:
     for trial in trials:
         cause = ""
         if trial.state == TrialState.FAIL:
-            cause = cause_of(trial) + (", retried" if was_retried(trial) else "")
+            cause = cause_of(trial)
         elif trial.state == TrialState.PRUNED:
             cause = f"behind the others at environment step {max(reports_of(trial), default='unknown')}"
             if STOP in trial.user_attrs:

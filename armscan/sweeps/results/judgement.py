@@ -98,10 +98,13 @@ class Judgement:
     def statement(self) -> str:
         """The comparison with the control in a sentence."""
         if self.chosen == CONTROL and self.have_others_failed:
-            return "The default configuration was chosen, because trainings of all other candidates have failed."
+            return "The control was chosen, because trainings of all other candidates have failed."
         if self.chosen == CONTROL:
             of_them = " that keeps all constraints" if self.violated and CONTROL not in self.violated else ""
-            return f"No setting{of_them} beat the default configuration in the selection, on the validation volumes."
+            return (
+                f"No setting{of_them} beat the control, the study's configuration without the searched values, in the "
+                "selection on the validation volumes."
+            )
         name = name_of(self.chosen).capitalize()
         if not self.differences and self.n_unjudged:
             return f"{name} was chosen; it has not been judged beside the control yet."

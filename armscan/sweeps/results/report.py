@@ -18,7 +18,7 @@ from armscan.sweeps.results.final_results import ConfigResult, final_results, fi
 from armscan.sweeps.results.judgement import Judgement, judge
 from armscan.sweeps.results.population_charts import population_charts
 from armscan.sweeps.results.selection import candidates_of, decision_section
-from armscan.sweeps.scheduling.state import StudyState, env_steps_of, is_feasible
+from armscan.sweeps.scheduling.state import StudyState, env_steps_of, is_feasible, was_retried
 from armscan.sweeps.scheduling.termination import REASON
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.attribute_names import (
@@ -156,10 +156,11 @@ def _trials(trials: Sequence[FrozenTrial], objectives: Sequence[str]) -> str:
 
 
 def _state(trial: FrozenTrial) -> str:
-    """Return the state of a trial, whether it violates a constraint, and which study it was taken from, if any."""
+    """Return the state of a trial, whether it was retried or violates a constraint, and the study it was taken from."""
     infeasible = "" if is_feasible(trial) else ", infeasible"
     elsewhere = f", in {trial.user_attrs[TAKEN_FROM]}" if TAKEN_FROM in trial.user_attrs else ""
-    return f"{_said(trial.state.name.lower())}{infeasible}{elsewhere}"
+    retried = ", retried" if was_retried(trial) else ""
+    return f"{_said(trial.state.name.lower())}{retried}{infeasible}{elsewhere}"
 
 
 def _failures(trials: Sequence[FrozenTrial]) -> str:

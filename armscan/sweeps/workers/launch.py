@@ -57,21 +57,22 @@ def run_workers(opened: OpenedStudy, given: StudyCommand, launcher: str, launch:
         KeyboardInterrupt: If it is interrupted; the workers have been asked to leave.
         ArmscanError: If the launcher has failed, and no worker is alive.
     """
+    monitor, search = StudyMonitor(opened), opened.search
+    if monitor.is_over() and _has_finished(opened):
+        print_sentence(f"study {search.name} in {search.scheduler.storage.uri}: nothing is left to do")
+        # Trusted: see `_upload`.
+        sync(opened.folder, lambda _: search.client, trust=True)
+        return
     started = f"{datetime.now():%Y-%m-%d_%H-%M-%S}_{socket.gethostname()}_{os.getpid()}"
     folder = working_folder() / opened.folder / "workers" / started
     folder.mkdir(parents=True)
     ProcessInfo.current(str(working_folder())).write(folder / LAUNCHER_FILE)
     arguments = _arguments(opened, given, launcher, folder)
-    tracked = TrackedRun.open_existing(
-        opened.search.client, opened.search.run_id, name=opened.settings.name, folder=folder
-    )
+    tracked = TrackedRun.open_existing(search.client, search.run_id, name=opened.settings.name, folder=folder)
     tracked.resume()
     leave_s = LEAVE_S if launcher in ON_THIS_MACHINE else LEAVE_ELSEWHERE_S
-    monitor = StudyMonitor(opened)
     with _leaving(opened, folder, tracked, leave_s, monitor):
         if monitor.is_over():
-            search = opened.search
-            print_sentence(f"study {search.name} in {search.scheduler.storage.uri}: nothing is left to do")
             return
         with progress_display(opened, folder):
             if launcher not in ON_THIS_MACHINE:
@@ -169,7 +170,7 @@ def _leaving(
             signal.signal(each, signal.SIG_IGN)
         (folder / STOP_FILE).touch()
         _end_workers(folder)
-        ended, reason = _conclude(opened, tracked)
+        ended, reason = _conclude(opened, tracked, monitor)
         _upload(opened, monitor, tracked, "KILLED" if is_asked else status or ended, reason)
         for each, handler in before.items():
             signal.signal(each, handler)
@@ -177,9 +178,9 @@ def _leaving(
         raise KeyboardInterrupt
 
 
-def _conclude(opened: OpenedStudy, tracked: TrackedRun) -> tuple[str, str | None]:
+def _conclude(opened: OpenedStudy, tracked: TrackedRun, monitor: StudyMonitor) -> tuple[str, str | None]:
     """Reclaim the trials of dead workers, and track the result; return the status of the study's run, and why."""
-    failure, stopped = None, ""
+    failure, stopped, is_left = None, "", True
     # If the storage is unavailable, the next start does it; if it is damaged, the result says so.
     with contextlib.suppress(ArmscanError), no_retry():
         for phase in opened.phases:
@@ -187,6 +188,8 @@ def _conclude(opened: OpenedStudy, tracked: TrackedRun) -> tuple[str, str | None
                 phase.close_runs_of(trial)
             failure = failure or phase.scheduler.failure_reason(phase.scheduler.state())
             stopped = stopped or phase.scheduler.read_stop_request()
+        # Workers of another command may go on with it.
+        is_left = not (monitor.is_over() or monitor.is_worked_on())
         search = opened.search.scheduler.study
         judgement = judge(opened.final_eval) if opened.final_eval is not None else None
         note = result_note(judgement)
@@ -200,7 +203,16 @@ def _conclude(opened: OpenedStudy, tracked: TrackedRun) -> tuple[str, str | None
             )
     if failure:
         return "FAILED", failure
-    return ("KILLED", f"stopped {stopped}") if stopped else ("FINISHED", None)
+    if stopped:
+        return "KILLED", f"stopped {stopped}"
+    return ("KILLED", "its workers have ended; the same command resumes it") if is_left else ("FINISHED", None)
+
+
+def _has_finished(opened: OpenedStudy) -> bool:
+    """Return whether the study's run has ended with its result."""
+    client = opened.search.client
+    with store_errors(client.uri):
+        return str(client.get_run(opened.search.run_id).info.status) == "FINISHED"
 
 
 def _has_result(opened: OpenedStudy) -> bool:

@@ -8,7 +8,7 @@ from armscan.stats.bootstrap import Estimate
 from armscan.sweeps.results.csv_tables import _difference_rows, _importance_rows, all_numbers
 from armscan.sweeps.results.difference import Difference
 from armscan.sweeps.results.judgement import Judgement
-from armscan.sweeps.storage.attribute_names import OBJECTIVES, RETRIED, RETRY_OF
+from armscan.sweeps.storage.attribute_names import FAILURE, OBJECTIVES, RETRIED, RETRY_OF
 
 
 def test_differences_have_the_probability_beside_the_difference():
@@ -30,6 +30,18 @@ def test_reports_of_a_retried_trial_are_those_of_its_retry_alone():
         study.tell(trial, 3.0)
     rows = all_numbers(study, study.trials, found=(), candidates=(), judgement=None)["reports"]
     assert rows == [{"trial": 1, "step": 100, "objective": "steps", "value": 3.0}]
+
+
+def test_retried_trials_are_told_from_failed_ones():
+    study = optuna.create_study()
+    study.set_user_attr(OBJECTIVES, ["steps"])
+    for attributes in ({RETRIED: True, FAILURE: "its worker died"}, {FAILURE: "its worker died"}):
+        study.enqueue_trial({}, user_attrs=attributes)
+        study.tell(study.ask(), state=optuna.trial.TrialState.FAIL)
+    rows = all_numbers(study, study.trials, found=(), candidates=(), judgement=None)
+    assert [row["retried"] for row in rows["trials"]] == [True, False]
+    assert [row["cause"] for row in rows["failures"]] == ["its worker died, retried", "its worker died"]
+    assert [row["cause"] for row in rows["endings"]] == ["its worker died", "its worker died, retried"]
 
 
 @pytest.mark.parametrize("direction", ["maximize", "minimize"])

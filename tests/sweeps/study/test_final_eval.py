@@ -201,7 +201,7 @@ def test_control_that_no_candidate_completed_the_race_beside_has_beaten_none(sto
             end(selection, trial, TRUE)
         else:
             selection.study.tell(trial, state=TrialState.FAIL)
-    expected = "The default configuration was chosen, because trainings of all other candidates have failed."
+    expected = "The control was chosen, because trainings of all other candidates have failed."
     assert judge(final).statement == expected
 
 
@@ -254,7 +254,7 @@ def test_control_that_is_the_best_is_the_result(storage_uri):
     final = run(storage_uri, true=TRUE | {CONTROL: 1.0})
     judgement = judge(final)
     assert judgement.chosen == CONTROL
-    assert "No setting beat the default configuration" in judgement.statement
+    assert "No setting beat the control" in judgement.statement
     assert {number for number, _ in trained(final.judgement)} == {CONTROL}
     assert judgement.differences == ()
 
