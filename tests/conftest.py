@@ -15,6 +15,7 @@ import pytest
 from hypothesis import settings
 
 from armscan.utils.processes import limit_threads
+from tests.support.processes import STARTED, end_all, processes_in
 from tests.support.requirements import unavailable
 
 # As in a run: the tests use all cores already.
@@ -55,6 +56,14 @@ def phantom_cache(tmp_path_factory):
 def activated():
     """Put the environment's programs on the path, so that suggested commands begin with their names alone."""
     os.environ["PATH"] = os.pathsep.join((str(Path(sys.executable).parent), os.environ["PATH"]))
+
+
+@pytest.fixture(autouse=True)
+def no_process_left(request):
+    """End what a test that failed has started in its folder."""
+    yield
+    if (folder := request.node.funcargs.get("tmp_path")) in STARTED:
+        end_all(partial(processes_in, folder))
 
 
 @pytest.fixture(scope="session")

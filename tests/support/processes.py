@@ -12,6 +12,8 @@ from pathlib import Path
 from tests.support.waiting import wait_until
 
 COMMAND = (sys.executable, "-m", "armscan.run")
+# Folders that commands were started in.
+STARTED: set[Path] = set()
 
 
 def start_run(
@@ -25,6 +27,7 @@ def start_run(
         command: Words before these. Default: `python -m armscan.run`.
         environment: Environment variables beside those of this process.
     """
+    STARTED.add(cwd)
     with (cwd / "printed").open("wb") as printed:
         return subprocess.Popen(
             [*command, *words],

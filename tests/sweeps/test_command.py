@@ -187,7 +187,8 @@ def test_study_survives_a_killed_worker_and_hands_its_trials_back_when_it_is_int
 
     wait_until(lambda: have_reported(2), process=process)
     os.kill(workers_in(tmp_path)[0], signal.SIGKILL)
-    wait_until(lambda: have_reported(3), process=process)
+    # The retry has the reports of the first attempt before a worker claims it.
+    wait_until(lambda: have_reported(3) and trials_of(tmp_path)[2].params, process=process)
     (dead,) = [trial for trial in trials_of(tmp_path) if trial.state.name == "FAIL"]
     retry = trials_of(tmp_path)[2]
     assert "its worker died" in dead.user_attrs["failure"]
