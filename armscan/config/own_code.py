@@ -77,11 +77,10 @@ def _with_parents(name: str) -> Iterator[str]:
 
 
 def _own_file(module: ModuleType) -> Path | None:
-    """Return the source file of a module; None if it is armscan's, or installed."""
-    file = getattr(module, "__file__", None)
-    if not file or not file.endswith(".py") or module.__name__.partition(".")[0] == "armscan":
+    """Return the source file of a module; None if it is armscan's, installed, or not a file, as in an archive."""
+    path = Path(getattr(module, "__file__", None) or "")
+    if path.suffix != ".py" or not path.is_file() or module.__name__.partition(".")[0] == "armscan":
         return None
-    path = Path(file)
     return None if any(path.is_relative_to(folder) for folder in INSTALLED) else path
 
 

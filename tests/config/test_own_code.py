@@ -52,6 +52,14 @@ def test_loaded_code_keeps_its_checksum(package: Path) -> None:
     assert own_code(CONFIG) == before
 
 
+def test_code_whose_file_is_gone_has_none(package: Path) -> None:
+    assert own_code(CONFIG)
+    _forget()
+    own_code({}, ["mine.parts.Nerve"])
+    (package / "parts.py").unlink()
+    assert "mine.parts" not in own_code(CONFIG)
+
+
 def test_armscans_own_and_installed_classes_have_none() -> None:
     assert own_code({"a": {"_target_": "armscan.agents.SAC"}, "b": {"_target_": "torch.nn.Tanh"}}) == {}
 
