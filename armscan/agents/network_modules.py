@@ -57,10 +57,11 @@ def init_linear(module: nn.Module) -> nn.Module:
 def is_plain(network: nn.Module) -> bool:
     """Return whether a network computes just what the types of its modules say: fully connected layers with ReLU.
 
-    Subclasses and hooks, such as those of `spectral_norm`, may compute anything.
+    Subclasses and hooks, such as those of `spectral_norm`, may compute anything; layers may share weights.
     """
-    parts, parameters = [*network.modules()], network.parameters()
+    parts, parameters = [*network.modules()], [*network.parameters()]
     is_hooked = any(getattr(part, name) for part in parts for name in HOOKS) or any(
-        each._backward_hooks for each in parameters
+        each._backward_hooks or each._post_accumulate_grad_hooks for each in parameters
     )
-    return not is_hooked and all(type(part) in PLAIN and "forward" not in vars(part) for part in parts)
+    is_shared = len(parameters) < len([*network.named_parameters(remove_duplicate=False)])
+    return not (is_hooked or is_shared) and all(type(part) in PLAIN and "forward" not in vars(part) for part in parts)

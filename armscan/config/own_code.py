@@ -18,6 +18,10 @@ from armscan.config.trust import foreign_targets
 from armscan.utils.files import sha256
 
 N_CHARS = 16
+# A longer list of checksums, which no tag could hold, is one checksum of all.
+MAX_CHARS = 4000
+ALL = "own_classes"
+PACKAGE_FOLDERS = frozenset({"site-packages", "dist-packages"})
 FUNCTIONS = ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda
 INSTALLED = tuple(Path(path) for name, path in sysconfig.get_paths().items() if name.endswith(("lib", "stdlib")))
 
@@ -39,7 +43,8 @@ def own_code(config: Mapping[str, Any], further: Iterable[str] = ()) -> dict[str
         if name not in sums and module is not None and (file := _own_file(module)) is not None:
             sums[name], imported = _read(module, file)
             names += imported
-    return dict(sorted(sums.items()))
+    sums = dict(sorted(sums.items()))
+    return sums if len(as_tag(sums)) <= MAX_CHARS else {ALL: sha256(as_tag(sums).encode())[:N_CHARS]}
 
 
 def changed_modules(before: str | None, now: Mapping[str, str]) -> list[str]:
@@ -81,7 +86,8 @@ def _own_file(module: ModuleType) -> Path | None:
     path = Path(getattr(module, "__file__", None) or "")
     if path.suffix != ".py" or not path.is_file() or module.__name__.partition(".")[0] == "armscan":
         return None
-    return None if any(path.is_relative_to(folder) for folder in INSTALLED) else path
+    is_installed = PACKAGE_FOLDERS & {*path.parts} or any(path.is_relative_to(folder) for folder in INSTALLED)
+    return None if is_installed else path
 
 
 @functools.cache
@@ -99,8 +105,14 @@ def _imported(module: ModuleType, source: bytes) -> Iterator[str]:
             for each in node.names:
                 yield from _with_parents(each.name)
         elif isinstance(node, ast.ImportFrom):
-            base = importlib.util.resolve_name("." * node.level + (node.module or ""), module.__package__)
+            # A relative import that fails, as in a script that is a module of a package, too.
+            package = module.__package__ or ""
+            if node.level > len(package.split(".")) or (node.level and not package):
+                continue
+            base = importlib.util.resolve_name("." * node.level + (node.module or ""), package)
             yield from _with_parents(base)
             yield from (f"{base}.{each.name}" for each in node.names)
-        elif not isinstance(node, FUNCTIONS):
+        elif not isinstance(node, FUNCTIONS) and not (
+            isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)
+        ):
             nodes += ast.iter_child_nodes(node)

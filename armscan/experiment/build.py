@@ -18,6 +18,7 @@ from armscan.agents import (
 )
 from armscan.config.compose import build_section
 from armscan.config.defaults import CLUSTER, to_plain
+from armscan.config.own_code import own_code
 from armscan.config.trust import needs_trust
 from armscan.envs import EnvFactory
 from armscan.errors import InvalidValueError, listed
@@ -101,6 +102,8 @@ def set_up(config: DictConfig) -> RunSetup:
         InvalidValueError: If a value is not allowed, or the agent cannot act in one of the environments.
     """
     silence_libraries()
+    # Keeps the checksums of own code as it is loaded, not as it may be edited while volumes are read.
+    own_code(to_plain(config))
     setup = build_setup(config)
     envs = (setup.training_env, setup.validation_env, setup.test_env, setup.video_env)
     trained = TrainingDomain.of(envs[0])

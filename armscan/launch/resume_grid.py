@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from omegaconf import DictConfig
 
 from armscan.config.defaults import FOLD, to_plain
+from armscan.config.own_code import changed_modules, own_code
 from armscan.config.task import is_under
 from armscan.config.trust import check_composed
 from armscan.errors import TrackingError
@@ -26,7 +27,7 @@ from armscan.experiment.resume import check_own_code, resume_run
 from armscan.experiment.runner import run_experiment
 from armscan.tracking import TrackingStore, load_run, open_store, sync
 from armscan.tracking.sanitize import params_of
-from armscan.tracking.tags import FOLDER_TAG, GRID_TAG, JOB_TAG, PARENT_TAG, STUDY_TAG
+from armscan.tracking.tags import FOLDER_TAG, GRID_TAG, JOB_TAG, OWN_CODE_TAG, PARENT_TAG, STUDY_TAG
 from armscan.training import Fingerprints, check_unchanged
 from armscan.utils.run_files import LAST_CHECKPOINT, folder_lock
 
@@ -47,8 +48,12 @@ def run_again(config: DictConfig, invocation: Invocation, job: Job) -> Metrics:
     earlier = earlier_runs(client, experiment_id, sha256_tags(provenance_files(resolved, setup)), job)
     if not any(run.data.tags.get(PARENT_TAG) == job.repeats for run in earlier):
         _check_volumes(client, experiment_id, params_of(resolved), setup.fingerprints, job)
-    for run in earlier:
-        check_own_code(run, resolved)
+    code = own_code(resolved)
+    for run in [run for run in earlier if changed_modules(run.data.tags.get(OWN_CODE_TAG), code)]:
+        if run.data.tags.get(PARENT_TAG) == job.repeats:
+            check_own_code(run, resolved)
+        # Another grid's, or a single run.
+        earlier.remove(run)
     for run in earlier:
         if run.info.status == "FINISHED":
             print(f"[{job.label}] has finished before: run {run.info.run_id}", flush=True)

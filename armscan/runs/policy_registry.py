@@ -51,14 +51,14 @@ def export_policy(tracking: str, run_id: str, folder: Path, *, trust: bool = Fal
     """
     source = agent_of_run(tracking, run_id, {}, trust=trust)
     assert source.run is not None
-    if source.code_note:
-        print_sentence(f"note: {source.code_note}")
     source.config.compute.update(PLAIN_COMPUTE)
     is_sampling = not source.config.agent.get("deterministic_eval", True)
     if is_sampling:
         source.config.agent.deterministic_eval = True
     own = cache(partial(own_split, source, ("training", "test")))
     evaluator = prepare_on_volumes(source, {TEST: own().test}, own)
+    if source.code_note:
+        print_sentence(f"note: {source.code_note}")
     if not isinstance(evaluator.agent, Learner):
         raise InvalidValueError(f"run is {run_id!r}, but its agent does not learn and has no policy")
     env = evaluator.envs[TEST]

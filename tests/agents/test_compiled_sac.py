@@ -279,6 +279,10 @@ def test_anything_else_is_left_to_tianshou(changes, reason):
         (lambda layer: layer.requires_grad_(requires_grad=False), "a network has weights that are not trained"),
         (lambda layer: layer.register_forward_hook(lambda *_: None), "its networks are not fully connected with ReLU"),
         (lambda layer: layer.weight.register_hook(lambda _: None), "its networks are not fully connected with ReLU"),
+        (
+            lambda layer: layer.weight.register_post_accumulate_grad_hook(lambda _: None),
+            "its networks are not fully connected with ReLU",
+        ),
     ],
 )
 def test_networks_with_frozen_weights_or_hooks_are_left_to_tianshou(change, reason):

@@ -1,11 +1,14 @@
 """Checksums of the code of own classes."""
 
+import importlib
 import sys
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from armscan.config import own_code as own_code_module
 from armscan.config.own_code import as_tag, changed_modules, own_code
 
 CONFIG = {"obs": {"_target_": "mine.parts.Nerve"}, "agent": {"_target_": "armscan.agents.SAC"}}
@@ -74,3 +77,35 @@ def test_what_cannot_be_imported_is_left_out() -> None:
 
 def test_nothing_is_known_of_runs_without_checksums(package: Path) -> None:
     assert changed_modules(None, own_code(CONFIG)) == []
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "try:\n    from .nowhere import X\nexcept ImportError:\n    X = 1\n\n\nclass Own:\n    pass\n",
+        "from typing import TYPE_CHECKING\n\nif TYPE_CHECKING:\n    import mine.late\n\n\nclass Own:\n    pass\n",
+    ],
+    ids=["import that fails", "import for types"],
+)
+def test_only_what_a_module_loads_counts(
+    tmp_path: Path, package: Path, monkeypatch: pytest.MonkeyPatch, text: str
+) -> None:
+    importlib.import_module("mine.late")
+    (tmp_path / "own_alone.py").write_text(text)
+    monkeypatch.delitem(sys.modules, "own_alone", raising=False)
+    assert [*own_code({"obs": {"_target_": "own_alone.Own"}})] == ["own_alone"]
+    del sys.modules["own_alone"]
+
+
+def test_code_in_an_archive_has_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with zipfile.ZipFile(tmp_path / "own.zip", "w") as archive:
+        archive.writestr("own_in_zip.py", "class Own:\n    pass\n")
+    monkeypatch.syspath_prepend(str(tmp_path / "own.zip"))
+    assert own_code({"obs": {"_target_": "own_in_zip.Own"}}) == {}
+
+
+def test_many_modules_have_one_checksum(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(own_code_module, "MAX_CHARS", 20)
+    before = own_code(CONFIG)
+    assert len(before) == 1
+    assert changed_modules(as_tag(before), own_code(CONFIG)) == []
