@@ -105,14 +105,18 @@ def _imported(module: ModuleType, source: bytes) -> Iterator[str]:
             for each in node.names:
                 yield from _with_parents(each.name)
         elif isinstance(node, ast.ImportFrom):
-            # A relative import that fails, as in a script that is a module of a package, too.
-            package = module.__package__ or ""
-            if node.level > len(package.split(".")) or (node.level and not package):
+            try:
+                base = importlib.util.resolve_name("." * node.level + (node.module or ""), module.__package__)
+            # The module catches it, too, as one that is also a script.
+            except ImportError:
                 continue
-            base = importlib.util.resolve_name("." * node.level + (node.module or ""), package)
             yield from _with_parents(base)
             yield from (f"{base}.{each.name}" for each in node.names)
-        elif not isinstance(node, FUNCTIONS) and not (
-            isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)
-        ):
+        elif not _is_left_out(node):
             nodes += ast.iter_child_nodes(node)
+
+
+def _is_left_out(node: ast.AST) -> bool:
+    """Return whether a statement is not executed when its module is loaded."""
+    is_for_types = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+    return is_for_types or isinstance(node, FUNCTIONS)

@@ -53,6 +53,7 @@ class RunSetup:
         smallest_slice_px: Largest shape (across, depth) in pixels that fits into all slices; images of every
             split are cropped to it by default.
         needs_trust: Whether its configuration names classes that are not armscan's.
+        own_code: Checksums of the modules of own classes, by their names.
     """
 
     split: Split
@@ -64,6 +65,7 @@ class RunSetup:
     seed: int
     smallest_slice_px: tuple[int, int]
     needs_trust: bool
+    own_code: Mapping[str, str]
 
     @cached_property
     def training_env(self) -> Env:
@@ -102,8 +104,6 @@ def set_up(config: DictConfig) -> RunSetup:
         InvalidValueError: If a value is not allowed, or the agent cannot act in one of the environments.
     """
     silence_libraries()
-    # Keeps the checksums of own code as it is loaded, not as it may be edited while volumes are read.
-    own_code(to_plain(config))
     setup = build_setup(config)
     envs = (setup.training_env, setup.validation_env, setup.test_env, setup.video_env)
     trained = TrainingDomain.of(envs[0])
@@ -127,6 +127,8 @@ def build_setup(config: DictConfig, split: Split | None = None) -> RunSetup:
         ArmscanError: If the configuration or a volume is refused.
     """
     check_config(config)
+    # As they are loaded: the files may be edited while the volumes are read.
+    own_modules = own_code(to_plain(config))
     budget = build_section(config, "training", Budget)
     split = split or build_section(config, "data", Split)
     smallest = smallest_slice(volume for part in split.parts.values() for volume in part.values())
@@ -150,6 +152,7 @@ def build_setup(config: DictConfig, split: Split | None = None) -> RunSetup:
         seed=config.seed,
         smallest_slice_px=smallest,
         needs_trust=needs_trust(to_plain(config)),
+        own_code=own_modules,
     )
 
 

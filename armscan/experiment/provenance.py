@@ -15,7 +15,7 @@ from omegaconf import DictConfig
 
 import armscan
 from armscan.config.defaults import CHOICES, to_plain
-from armscan.config.own_code import as_tag, own_code
+from armscan.config.own_code import as_tag
 from armscan.experiment.build import RunSetup
 from armscan.experiment.job import Invocation
 from armscan.tracking import (
@@ -102,7 +102,7 @@ def start_tracking(
             **place_tags(invocation.folder),
             "working_folder": str(Path.cwd()),
             **sha256_tags(files),
-            **({OWN_CODE_TAG: as_tag(code)} if (code := own_code(resolved)) else {}),
+            **({OWN_CODE_TAG: as_tag(setup.own_code)} if setup.own_code else {}),
             **({JOB_TAG: str(job.number)} if job else {}),
             **(tags or {}),
         },

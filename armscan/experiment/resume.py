@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,10 +19,10 @@ from pydantic import TypeAdapter, ValidationError
 
 from armscan.agents import Learner
 from armscan.config.defaults import RESUME, TRACKING_URI, default_tracking
-from armscan.config.own_code import changed_modules, own_code
+from armscan.config.own_code import changed_modules
 from armscan.config.trust import TRUST, check_stored_overrides, stored_config
 from armscan.errors import InvalidValueError, ResumeError, UntrustedError, few, printable
-from armscan.experiment.build import set_up
+from armscan.experiment.build import RunSetup, set_up
 from armscan.experiment.provenance import place_tags, volume_tags
 from armscan.experiment.runner import run_tracked
 from armscan.tracking import TrackedRun, TrackingStore, check_run_id, check_version, find_run, open_existing_store, sync
@@ -143,7 +143,7 @@ def resume_run(
         print(f"resuming {printable(run.info.run_name)}, run {run_id}", flush=True)
         setup = set_up(OmegaConf.create(migrated))
         _check_volumes(run, folder, setup.fingerprints)
-        check_own_code(run, migrated)
+        check_own_code(run, setup)
         agent = setup.agent
         earlier = resume_from_checkpoint(agent, folder, setup.provenance(run_id)) if isinstance(agent, Learner) else []
         tags = volume_tags(setup) | place_tags(folder)
@@ -245,9 +245,9 @@ def _check_volumes(run: Run, folder: Path, now: Fingerprints) -> None:
         check_unchanged(then, now, f"run {run.info.run_id} was started with")
 
 
-def check_own_code(run: Run, config: Mapping[str, Any]) -> None:
+def check_own_code(run: Run, setup: RunSetup) -> None:
     """Raise `ResumeError` if a run would continue with other code of the user's own classes."""
-    if changed := changed_modules(run.data.tags.get(OWN_CODE_TAG), own_code(config)):
+    if changed := changed_modules(run.data.tags.get(OWN_CODE_TAG), setup.own_code):
         raise ResumeError(
             f"run {run.info.run_id} was started with other code of {few(changed)}: put it back, or start another run"
         )

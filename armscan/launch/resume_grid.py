@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from omegaconf import DictConfig
 
 from armscan.config.defaults import FOLD, to_plain
-from armscan.config.own_code import changed_modules, own_code
+from armscan.config.own_code import changed_modules
 from armscan.config.task import is_under
 from armscan.config.trust import check_composed
 from armscan.errors import TrackingError
@@ -48,12 +48,11 @@ def run_again(config: DictConfig, invocation: Invocation, job: Job) -> Metrics:
     earlier = earlier_runs(client, experiment_id, sha256_tags(provenance_files(resolved, setup)), job)
     if not any(run.data.tags.get(PARENT_TAG) == job.repeats for run in earlier):
         _check_volumes(client, experiment_id, params_of(resolved), setup.fingerprints, job)
-    code = own_code(resolved)
-    for run in [run for run in earlier if changed_modules(run.data.tags.get(OWN_CODE_TAG), code)]:
+    for run in earlier:
         if run.data.tags.get(PARENT_TAG) == job.repeats:
-            check_own_code(run, resolved)
-        # Another grid's, or a single run.
-        earlier.remove(run)
+            check_own_code(run, setup)
+    # Of other grids, and single runs.
+    earlier = [run for run in earlier if not changed_modules(run.data.tags.get(OWN_CODE_TAG), setup.own_code)]
     for run in earlier:
         if run.info.status == "FINISHED":
             print(f"[{job.label}] has finished before: run {run.info.run_id}", flush=True)

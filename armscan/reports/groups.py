@@ -58,6 +58,11 @@ class Group:
         return all(training.volumes in (None, of_fold.get(training.fold)) for training in self.trainings)
 
     @property
+    def has_same_own_code(self) -> bool:
+        """Whether no two of its trainings had different code of own classes."""
+        return len({training.own_code for training in self.trainings} - {None}) <= 1
+
+    @property
     def commits(self) -> set[str]:
         """Commits of armscan that its trainings ran, as far as they are known."""
         return {training.commit for training in self.trainings if training.commit is not None}

@@ -19,20 +19,18 @@ from armscan.tracking import TrackingStore
 from armscan.tracking.histories import History, metric_histories
 from armscan.tracking.run import PRUNED
 from armscan.tracking.store import store_errors
-from armscan.tracking.tags import CHOICE, COMMIT_TAG, OVERRIDES_TAG, PRUNED_TAG, VERSION_TAG
+from armscan.tracking.tags import CHOICE, COMMIT_TAG, OVERRIDES_TAG, OWN_CODE_TAG, PRUNED_TAG, VERSION_TAG
 from armscan.training import TEST, Evaluation
 from armscan.training.fingerprints import Fingerprints, fingerprints_in
 from armscan.training.metric_display import title_of
 from armscan.utils.arrays import FloatArray
-from armscan.utils.files import sha256
 from armscan.utils.run_files import (
     BASELINES_FILE,
     EVALUATION_FILE,
     ID_CHARS,
-    RESULT_SHA256_TAGS,
-    SHA256_TAGS,
     VIDEO_FILE,
     VOLUMES_FILE,
+    is_as_tagged,
 )
 
 WALL = "wall_s"
@@ -43,7 +41,6 @@ OF_THE_TRAINING = ("update/", "train/return", "train/length", "speed/")
 # MLflow's value of a parameter that is not set.
 UNSET = "None"
 T = TypeVar("T")
-SUMS = SHA256_TAGS | RESULT_SHA256_TAGS
 
 
 @dataclass(frozen=True)
@@ -77,6 +74,7 @@ class TrackedTraining:
         evaluation: Final evaluation on the test volumes; None if it has kept none.
         baselines: Episodes of the baselines on the test volumes, by their names. Default: none, as in older runs.
         overridden: Keys that its command line set. Default: none.
+        own_code: Checksums of the modules of own classes, as a tag has them. Default: None, not known, or none.
         commit: Commit of the code, or the version of an installed package. Default: None, not known.
         volumes: Fingerprints of its volumes by split (training, validation, test) and name; None if it has kept none.
         video: Episode as an animated GIF; None if it has kept none.
@@ -93,6 +91,7 @@ class TrackedTraining:
     evaluation: Evaluation | None = field(repr=False)
     baselines: Mapping[str, Evaluation] = field(default_factory=dict, repr=False)
     overridden: frozenset[str] = frozenset()
+    own_code: str | None = None
     commit: str | None = None
     volumes: Fingerprints | None = field(repr=False)
     video: bytes | None = field(repr=False)
@@ -191,6 +190,7 @@ def _training(run: Run, histories: Mapping[str, History], files: Mapping[str, by
         evaluation=evaluation if evaluation and evaluation.episodes else None,
         baselines=baselines or {},
         overridden=frozenset(each.lstrip("+").partition("=")[0] for each in tags.get(OVERRIDES_TAG, "").split()),
+        own_code=tags.get(OWN_CODE_TAG),
         commit=tags.get(COMMIT_TAG, tags.get(VERSION_TAG)),
         volumes=_parsed(run, files, VOLUMES_FILE, lambda contents: fingerprints_in(contents, VOLUMES_FILE)),
         video=files.get(VIDEO_FILE),
@@ -236,7 +236,7 @@ def _parsed(run: Run, files: Mapping[str, bytes], name: str, read: Callable[[Any
     if (contents := files.get(name)) is None:
         return None
     damaged = TrackingError(f"run {run.info.run_id}: its {name} is damaged; put it back, or leave the run out")
-    if run.data.tags.get(SUMS.get(name, ""), digest := sha256(contents)) != digest:
+    if not is_as_tagged(name, contents, run.data.tags):
         raise damaged
     try:
         return read(json.loads(contents))

@@ -11,6 +11,7 @@ from armscan.reports.groups import Group, differing_rules
 from armscan.reports.load import TrackedTraining, validation_titles
 from armscan.reports.significance import evaluations_by_seed
 from armscan.stats.aggregation import MIN_SEEDS
+from armscan.tracking.tags import OWN_CODE_TAG
 from armscan.training.headline import MIN_SUBJECTS
 from armscan.utils.run_files import ID_CHARS
 
@@ -36,7 +37,7 @@ def notes_on(
         *_on_unfinished(groups),
         *_on_missing(groups),
         *_on_curves(groups, curves),
-        *_on_commits(groups),
+        *_on_code(groups),
         *_on_volumes(groups),
         *_on_rules(groups, has_other_volumes=has_other_volumes),
     ]
@@ -119,8 +120,10 @@ def _on_curves(groups: Sequence[Group], curves: Curves) -> Iterator[str]:
             )
 
 
-def _on_commits(groups: Sequence[Group]) -> Iterator[str]:
+def _on_code(groups: Sequence[Group]) -> Iterator[str]:
     for group in groups:
+        if not group.has_same_own_code:
+            yield f"Group {group.number}: its runs used different code of your own classes (tag {OWN_CODE_TAG})."
         if len(group.commits) > 1:
             commits = ", ".join(sorted(commit[:ID_CHARS] for commit in group.commits))
             yield f"Group {group.number}: its runs used different versions of armscan: {commits}."

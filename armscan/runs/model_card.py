@@ -19,8 +19,7 @@ from armscan.tracking.tags import EVALUATED_TAG
 from armscan.training import ON_PLANE, TEST, Evaluation, ResultTable
 from armscan.training.episode_results import metric_prefix
 from armscan.training.metric_display import LEADING
-from armscan.utils.files import sha256
-from armscan.utils.run_files import BASELINES_FILE, EVALUATION_FILE, RESULT_SHA256_TAGS
+from armscan.utils.run_files import BASELINES_FILE, EVALUATION_FILE, is_as_tagged
 
 # Longest description that MLflow's databases accept.
 MAX_CHARS = 5000
@@ -141,7 +140,7 @@ def _own_baselines(run: FoundRun, folder: Path) -> dict[str, dict[str, Evaluatio
 
 def _json(run: FoundRun, run_id: str, file: str, folder: Path) -> Any:
     text = Path(run.client.download_artifacts(run_id, file, str(folder))).read_bytes()
-    if run_id == run.run_id and run.tags.get(RESULT_SHA256_TAGS.get(file, ""), digest := sha256(text)) != digest:
+    if run_id == run.run_id and not is_as_tagged(file, text, run.tags):
         raise _damaged(run_id, file)
     try:
         return json.loads(text)

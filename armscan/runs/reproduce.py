@@ -12,8 +12,8 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from armscan.config.command_hints import armscan_command
-from armscan.config.defaults import CHOICES, to_plain
-from armscan.config.own_code import changed_modules, own_code
+from armscan.config.defaults import CHOICES
+from armscan.config.own_code import changed_modules
 from armscan.errors import InvalidValueError, TrackingError, few
 from armscan.evaluation.agent_source import from_its_folder
 from armscan.experiment.build import RunSetup, set_up
@@ -101,7 +101,7 @@ def differences(original: Original) -> list[str]:
             f"; its {DIFF_FILE} is among its artifacts" if DIFF_SUM in tags and DIFF_FILE in original.run.files else ""
         )
         lines.append(f"changes since the commit {_changes(tags)}, and {_changes(now)} now{kept}")
-    if modules := changed_modules(tags.get(OWN_CODE_TAG), own_code(to_plain(original.config))):
+    if modules := changed_modules(tags.get(OWN_CODE_TAG), original.setup.own_code):
         lines.append(f"the code of {few(modules)} has changed since")
     if "resumed" in tags:
         lines.append(f"the run was cut off and resumed (times: {tags['resumed']}), which changes no figure by itself")

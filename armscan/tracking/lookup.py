@@ -17,8 +17,7 @@ from armscan.errors import InvalidValueError, TrackingError, TrackingUnavailable
 from armscan.tracking.store import open_existing_store, store_errors
 from armscan.tracking.tags import EVALUATED_TAG, VERSION_TAG
 from armscan.tracking.tracking_store import TrackingStore, all_pages
-from armscan.utils.files import sha256
-from armscan.utils.run_files import BEST_CHECKPOINT, CONFIG_FILE, SHA256_TAGS, VOLUMES_FILE
+from armscan.utils.run_files import BEST_CHECKPOINT, CONFIG_FILE, SHA256_TAGS, VOLUMES_FILE, is_as_tagged
 from armscan.utils.strict_yaml import load_yaml
 
 if TYPE_CHECKING:
@@ -97,7 +96,7 @@ class FoundRun:
                 "it was removed, or this is something else"
             )
         contents = self._fetched(file, folder).read_bytes()
-        if sha256(contents) != self.tags.get(SHA256_TAGS[file], sha256(contents)):
+        if not is_as_tagged(file, contents, self.tags):
             raise TrackingError(
                 f"run {self.run_id}: its {file} is not the one that it was started with: changed, or another run's"
             )

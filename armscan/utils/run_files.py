@@ -5,12 +5,13 @@ from __future__ import annotations
 import contextlib
 import fnmatch
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from filelock import FileLock, Timeout
 
 from armscan.errors import FolderInUseError, FolderTakenError
+from armscan.utils.files import sha256
 
 # The checkpoints of a training, and what its run was started with.
 BEST_CHECKPOINT, LAST_CHECKPOINT = "best.pt", "last.pt"
@@ -46,6 +47,12 @@ OUTBOX_FOLDER = "tracking"
 # Of the files of a run's outbox, named after the run: the uploaded position, the lock, and the entries.
 OUTBOX_SUFFIXES = (".delivered.json", ".lock", ".jsonl")
 RUN_ID_PATTERN = "[0-9a-f]" * 32
+
+
+def is_as_tagged(name: str, contents: bytes, tags: Mapping[str, str]) -> bool:
+    """Return whether a run's file has the checksum in the run's tags, if they have one."""
+    tag = {**SHA256_TAGS, **RESULT_SHA256_TAGS}.get(name, "")
+    return tag not in tags or tags[tag] == sha256(contents)
 
 
 def is_made_by_run(name: str) -> bool:

@@ -1,17 +1,18 @@
 """The earlier runs of a repeated grid's jobs."""
 
+import contextlib
 import json
 
 import pytest
 
 from armscan.config.compose import compose
 from armscan.config.defaults import to_plain
-from armscan.errors import ChangedVolumesError, UntrustedError
+from armscan.errors import ChangedVolumesError, ResumeError, UntrustedError
 from armscan.experiment.build import build_setup
 from armscan.experiment.job import Invocation, Job
 from armscan.launch.resume_grid import earlier_runs, run_again
 from armscan.tracking import TrackedRun
-from armscan.tracking.tags import GRID_TAG, PARENT_TAG, STUDY_TAG
+from armscan.tracking.tags import GRID_TAG, OWN_CODE_TAG, PARENT_TAG, STUDY_TAG
 from armscan.utils.files import sha256
 from armscan.utils.run_files import SHA256_TAGS, VOLUMES_FILE
 from tests.support.stores import store_in
@@ -78,6 +79,22 @@ def test_grid_goes_on_with_the_same_volumes_alone(tmp_path, database, change):
             with pytest.raises(ChangedVolumesError, match=what):
                 run_again(config, Invocation(tmp_path, [], "", {}, job), job)
     assert bool(begun) == (change in ("lost", None))
+
+
+@pytest.mark.parametrize("is_of_grid", [True, False])
+def test_only_runs_of_the_grid_must_have_the_same_own_code(tmp_path, database, monkeypatch, is_of_grid):
+    config = compose([*FEW, f"tracking.uri=sqlite:///{tmp_path}/mlruns.db"])
+    client, experiment_id = store_in(tmp_path, config.tracking.experiment)
+    tags = {OWN_CODE_TAG: "parts:01", PARENT_TAG: ("1" if is_of_grid else "3") * 32}
+    other = client.create_run(experiment_id, name="n", tags=tags)
+    client.set_terminated(other.info.run_id)
+    job, begun = Job(0, "", "", "2" * 32, tmp_path, repeats="1" * 32, is_trusted=False), []
+    monkeypatch.setattr("armscan.launch.resume_grid.earlier_runs", lambda *_: [client.get_run(other.info.run_id)])
+    monkeypatch.setattr("armscan.launch.resume_grid.run_experiment", lambda *_: begun.append(1))
+    expected = pytest.raises(ResumeError, match="other code of parts") if is_of_grid else contextlib.nullcontext()
+    with expected:
+        run_again(config, Invocation(tmp_path, [], "", {}, job), job)
+    assert bool(begun) is not is_of_grid
 
 
 def test_job_of_a_stored_command_line_builds_no_class_of_others(tmp_path):

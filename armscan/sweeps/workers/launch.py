@@ -58,11 +58,12 @@ def run_workers(opened: OpenedStudy, given: StudyCommand, launcher: str, launch:
         ArmscanError: If the launcher has failed, and no worker is alive.
     """
     monitor, search = StudyMonitor(opened), opened.search
-    if monitor.is_over() and _has_finished(opened):
+    if is_over := monitor.is_over():
         print_sentence(f"study {search.name} in {search.scheduler.storage.uri}: nothing is left to do")
-        # Trusted: see `_upload`.
-        sync(opened.folder, lambda _: search.client, trust=True)
-        return
+        if _has_finished(opened):
+            # Trusted: see `_upload`.
+            sync(opened.folder, lambda _: search.client, trust=True)
+            return
     started = f"{datetime.now():%Y-%m-%d_%H-%M-%S}_{socket.gethostname()}_{os.getpid()}"
     folder = working_folder() / opened.folder / "workers" / started
     folder.mkdir(parents=True)
@@ -72,7 +73,7 @@ def run_workers(opened: OpenedStudy, given: StudyCommand, launcher: str, launch:
     tracked.resume()
     leave_s = LEAVE_S if launcher in ON_THIS_MACHINE else LEAVE_ELSEWHERE_S
     with _leaving(opened, folder, tracked, leave_s, monitor):
-        if monitor.is_over():
+        if is_over:
             return
         with progress_display(opened, folder):
             if launcher not in ON_THIS_MACHINE:
