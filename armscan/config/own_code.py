@@ -56,13 +56,30 @@ def changed_modules(before: str | None, now: Mapping[str, str]) -> list[str]:
     """
     if before is None:
         return []
-    then = dict(each.rpartition(":")[::2] for each in before.split())
+    then = _sums_in(before)
     return sorted(name for name in then.keys() | now.keys() if then.get(name) != now.get(name))
+
+
+def mixed_modules(tags: Iterable[str | None]) -> list[str]:
+    """Return the names of modules of which some runs have loaded different versions.
+
+    Args:
+        tags: Checksums of each run, as `as_tag` wrote them; None if a run has none.
+    """
+    versions: dict[str, set[str]] = {}
+    for tag in tags:
+        for name, each in _sums_in(tag or "").items():
+            versions.setdefault(name, set()).add(each)
+    return sorted(name for name, sums in versions.items() if len(sums) > 1)
 
 
 def as_tag(sums: Mapping[str, str]) -> str:
     """Return checksums as the text of a tag."""
     return " ".join(f"{name}:{each}" for name, each in sums.items())
+
+
+def _sums_in(tag: str) -> dict[str, str]:
+    return dict(each.rpartition(":")[::2] for each in tag.split())
 
 
 def _modules_of(target: str) -> Iterator[str]:

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 from armscan.config.defaults import FOLD
 from armscan.config.error_messages import one_line_message
+from armscan.config.own_code import mixed_modules
 from armscan.config.task import have_same_task
-from armscan.errors import TrackingError
+from armscan.errors import TrackingError, few
 from armscan.experiment.console import print_result_table
 from armscan.experiment.job import JobOutcome
 from armscan.experiment.results import few_subjects
@@ -22,7 +23,7 @@ from armscan.launch.folds_table import AGENT, ALL_FOLDS, folds_table
 from armscan.launch.grid_jobs import jobs_of
 from armscan.reports.html import page
 from armscan.tracking.outbox import now_ms
-from armscan.tracking.tags import FOLDER_TAG, JOB_TAG
+from armscan.tracking.tags import FOLDER_TAG, JOB_TAG, OWN_CODE_TAG
 from armscan.tracking.uploader import set_description
 from armscan.training.episode_results import TEST_METRICS, metric_prefix
 from armscan.training.headline import ABOVE_RANDOM
@@ -50,17 +51,20 @@ def keep_tables(
 
     try:
         planned = jobs_of(parent["overrides"])[1] if parent["has_known_jobs"] else None
-        n_finished = sum(outcome.failure is None for outcome in outcomes.values())
         n_jobs = len(outcomes) if planned is None else len(planned)
-        if planned is not None and (pooled := _pooled_folds(parent, outcomes, runs, planned)) is not None:
-            of_folds, notes = pooled
+        n_finished = sum(outcome.failure is None for outcome in outcomes.values())
+        finished = [run for run in runs if outcomes[run.data.tags[JOB_TAG]].failure is None]
+        mixed = mixed_modules(run.data.tags.get(OWN_CODE_TAG) for run in finished)
+        on_code = [f"the jobs used different versions of {few(mixed)} (tag {OWN_CODE_TAG})"] if mixed else []
+        if planned is not None and (pooled := _pooled_folds(parent, outcomes, finished, planned)) is not None:
+            of_folds, notes = pooled[0], [*pooled[1], *on_code]
             print_result_table(f"{next(iter(of_folds.results)).split(', ')[1]} (test)", of_folds, notes)
             keep_folds_table(of_folds, table, folder, store, parent["run_id"], notes)
         else:
-            notes = []
-            if n_finished < n_jobs:
-                notes.append(f"of {n_jobs} jobs, {n_jobs - n_finished} without a result")
-                print(f"note: {notes[0]}")
+            missing = [f"of {n_jobs} jobs, {n_jobs - n_finished} without a result"] if n_finished < n_jobs else []
+            notes = [*missing, *on_code]
+            for note in notes:
+                print(f"note: {note}")
             body = f"<p><code>{html.escape(' '.join(parent['overrides']))}</code></p>{table.html()}"
             text = page(f"Grid of {counted(n_jobs, 'job')}", body, notes=notes)
             _keep_page(folder, text, "\n\n".join([*notes, table.markdown()]), store, parent["run_id"])
@@ -115,14 +119,13 @@ def _keep_page(folder: Path, text: str, description: str, store: TrackingStore, 
 def _pooled_folds(
     parent: Mapping[str, Any],
     outcomes: Mapping[str, JobOutcome],
-    runs: Sequence[Run],
+    finished: Sequence[Run],
     jobs: Sequence[Sequence[str]],
 ) -> tuple[ResultTable, list[str]] | None:
     """Return one table over all folds of a cross-validation, and notes on it; None of another grid."""
     if not any(override.startswith(f"{FOLD}=") for override in parent["overrides"]):
         return None
     planned = [dict(override.partition("=")[::2] for override in job) for job in jobs]
-    finished = [run for run in runs if outcomes[run.data.tags[JOB_TAG]].failure is None]
     varied = {
         number: [override for override in shlex.split(outcome.overrides) if override not in parent["common"]]
         for number, outcome in outcomes.items()

@@ -127,7 +127,7 @@ def _summary(groups: Sequence[Group]) -> str:
     runs = f"{counted(n_trainings, 'run')} in {counted(len(groups), 'group')}"
     others = {
         "their volumes": any(not group.has_same_volumes for group in groups),
-        "the code of own classes": any(not group.has_same_own_code for group in groups),
+        "the code of own classes": any(group.mixed_modules for group in groups),
         "armscan's version": any(len(group.commits) > 1 for group in groups),
     }
     but = " and ".join(name for name, differs in others.items() if differs)

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from armscan.config.defaults import ADDED, FOLD, NOT_COMPARED
+from armscan.config.own_code import mixed_modules
 from armscan.config.task import is_under, rules_in
 from armscan.reports.load import TrackedTraining
 
@@ -58,9 +59,9 @@ class Group:
         return all(training.volumes in (None, of_fold.get(training.fold)) for training in self.trainings)
 
     @property
-    def has_same_own_code(self) -> bool:
-        """Whether no two of its trainings had different code of own classes."""
-        return len({training.own_code for training in self.trainings} - {None}) <= 1
+    def mixed_modules(self) -> list[str]:
+        """Modules of own classes of which its trainings have loaded different versions."""
+        return mixed_modules(training.own_code for training in self.trainings)
 
     @property
     def commits(self) -> set[str]:

@@ -6,6 +6,7 @@ import html
 from collections.abc import Iterator, Sequence
 
 from armscan.config.defaults import FOLDS
+from armscan.errors import few
 from armscan.reports.charts import Curves
 from armscan.reports.groups import Group, differing_rules
 from armscan.reports.load import TrackedTraining, validation_titles
@@ -122,8 +123,8 @@ def _on_curves(groups: Sequence[Group], curves: Curves) -> Iterator[str]:
 
 def _on_code(groups: Sequence[Group]) -> Iterator[str]:
     for group in groups:
-        if not group.has_same_own_code:
-            yield f"Group {group.number}: its runs used different code of your own classes (tag {OWN_CODE_TAG})."
+        if mixed := group.mixed_modules:
+            yield f"Group {group.number}: its runs used different versions of {few(mixed)} (tag {OWN_CODE_TAG})."
         if len(group.commits) > 1:
             commits = ", ".join(sorted(commit[:ID_CHARS] for commit in group.commits))
             yield f"Group {group.number}: its runs used different versions of armscan: {commits}."

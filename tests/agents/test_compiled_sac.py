@@ -292,6 +292,13 @@ def test_networks_with_frozen_weights_or_hooks_are_left_to_tianshou(change, reas
     assert fallback_reason(ours, Compute("cpu"), replay) == reason
 
 
+def test_networks_with_shared_weights_are_left_to_tianshou():
+    replay = filled_replay(5, 2)
+    ours = compiled(replay)
+    ours.policy.actor.sigma.model[0].weight = ours.policy.actor.mu.model[0].weight
+    assert fallback_reason(ours, Compute("cpu"), replay) == "its networks are not fully connected with ReLU"
+
+
 def test_other_replay_buffers_are_left_to_tianshou():
     replay = filled_replay(5, 2, PrioritizedVectorReplayBuffer, alpha=0.6, beta=0.4)
     ours = compiled(replay)

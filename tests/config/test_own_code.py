@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from armscan.config import own_code as own_code_module
-from armscan.config.own_code import as_tag, changed_modules, own_code
+from armscan.config.own_code import as_tag, changed_modules, mixed_modules, own_code
 
 CONFIG = {"obs": {"_target_": "mine.parts.Nerve"}, "agent": {"_target_": "armscan.agents.SAC"}}
 
@@ -77,6 +77,12 @@ def test_what_cannot_be_imported_is_left_out() -> None:
 
 def test_nothing_is_known_of_runs_without_checksums(package: Path) -> None:
     assert changed_modules(None, own_code(CONFIG)) == []
+
+
+def test_modules_of_which_runs_loaded_different_versions_are_named() -> None:
+    # Runs of a grid may differ in which classes they have.
+    assert mixed_modules(["mine:01 other:02", None, "mine:01 third:03"]) == []
+    assert mixed_modules(["mine:01 other:02", "mine:02 other:02", "mine:01"]) == ["mine"]
 
 
 @pytest.mark.parametrize(

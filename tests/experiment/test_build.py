@@ -1,5 +1,6 @@
 """Objects built from a configuration."""
 
+import hashlib
 from dataclasses import replace
 
 import numpy as np
@@ -87,6 +88,22 @@ def test_build_refuses_an_agent_that_learns_but_lacks_what_training_needs(phanto
     config.agent = {"_target_": "tests.experiment.test_build.Unfinished"}
     with pytest.raises(InvalidValueError, match=r"agent is Unfinished, which learns, .* has no .*policy.* or weights"):
         build_setup(config)
+
+
+def test_own_code_is_that_which_runs_if_its_file_is_edited_while_volumes_are_read(phantom, monkeypatch, tmp_path):
+    module = tmp_path / "own_agent_edited.py"
+    module.write_text("from armscan.agents import Random\n\n\nclass Own(Random):\n    pass\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+
+    def read_slowly(**_):
+        module.write_text("")
+        return split_of_sizes(phantom)
+
+    monkeypatch.setattr("armscan.training.phantom_data", read_slowly)
+    expected = hashlib.sha256(module.read_bytes()).hexdigest()
+    own_code = build_setup(compose(["agent=random", "agent._target_=own_agent_edited.Own"])).own_code
+    assert not module.read_text()
+    assert expected.startswith(own_code["own_agent_edited"])
 
 
 @pytest.mark.parametrize("section", ["data", "training", "compute"])

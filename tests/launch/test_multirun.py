@@ -18,7 +18,7 @@ from armscan.experiment.job import INTERRUPTED, OUTCOME_FOLDER, PARENT_FILE, Job
 from armscan.launch.grid_jobs import shared_overrides
 from armscan.launch.multirun import Multirun, end_grid
 from armscan.tracking import begin_outbox, sync
-from armscan.tracking.tags import BEST_TAG, FOLDER_TAG, JOB_TAG, PARENT_TAG
+from armscan.tracking.tags import BEST_TAG, FOLDER_TAG, JOB_TAG, OWN_CODE_TAG, PARENT_TAG
 from armscan.utils.processes import ProcessInfo
 from tests.support.stores import store_in
 
@@ -66,19 +66,24 @@ def test_job_that_was_stopped_alone_has_not_failed(tmp_path, database, monkeypat
     )
     (tmp_path / OUTCOME_FOLDER).mkdir()
     jobs = []
-    for number, failure in enumerate((INTERRUPTED, None)):
+    for number, failure in enumerate((INTERRUPTED, None, None)):
         outcome = JobOutcome(f"seed={number}", f"seed={number}", failure)
         (tmp_path / OUTCOME_FOLDER / f"{number}.json").write_text(json.dumps(asdict(outcome)))
         tags = {JOB_TAG: str(number), FOLDER_TAG: str(tmp_path / str(number)), PARENT_TAG: parent}
+        tags |= {OWN_CODE_TAG: f"mine:01 parts:{number}"}
         jobs.append(store.create_run(experiment_id, name="job", tags=tags).info.run_id)
-    store.set_terminated(jobs[1], "FINISHED")
+        if failure is None:
+            store.set_terminated(jobs[-1], "FINISHED")
     # It was stopped after its evaluation: its table shows no result.
-    for job, rate in zip(jobs, (0.9, 0.4), strict=True):
+    for job, rate in zip(jobs, (0.9, 0.4, 0.3), strict=True):
         store.log_batch(job, metrics=[Metric("test_volumes/on_plane_5mm_10deg", rate, 1, 0)])
     monkeypatch.setattr(Multirun, "folder", tmp_path)
     assert end_grid() == 1
-    assert [store.get_run(run_id).info.status for run_id in (*jobs, parent)] == ["KILLED", "FINISHED", "KILLED"]
-    assert "failed" not in capsys.readouterr().err
+    assert [store.get_run(run_id).info.status for run_id in jobs] == ["KILLED", "FINISHED", "FINISHED"]
+    assert store.get_run(parent).info.status == "KILLED"
+    printed = capsys.readouterr()
+    assert "failed" not in printed.err
+    assert "note: the jobs used different versions of parts (tag own_code)" in printed.out
     assert store.get_run(parent).data.tags[BEST_TAG] == jobs[1]
 
 

@@ -235,10 +235,10 @@ def test_runs_of_a_group_that_ran_other_code_are_told(written, make_training):
 
 def test_runs_of_a_group_whose_own_classes_had_other_code_are_told(written, make_training):
     page, _ = written(*(make_training(seed, own_code=code) for seed, code in enumerate(("parts:01", "parts:02"))))
-    assert "Group 1: its runs used different code of your own classes (tag own_code)." in page
+    assert "Group 1: its runs used different versions of parts (tag own_code)." in page
     assert "differ by nothing but the seed, except for the code of own classes." in page
     page, _ = written(make_training(0, own_code="parts:01"), make_training(1, own_code=None))
-    assert "code of your own classes" not in page
+    assert "(tag own_code)" not in page
 
 
 def test_pairs_that_chance_alone_sets_in_bold_are_counted(written, make_training):
