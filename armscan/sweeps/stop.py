@@ -14,12 +14,15 @@ from optuna.exceptions import UpdateFinishedTrialError
 from optuna.trial import TrialState
 
 from armscan.errors import StudyError
-from armscan.sweeps.storage.attribute_names import LEASE, RUN, STOP, STUDY_RUN
+from armscan.sweeps.storage.attribute_names import FINALIST, LEASE, RUN, STOP, STUDY_RUN
 from armscan.sweeps.storage.attributes import FINAL_SUFFIXES
 from armscan.sweeps.storage.storage import Storage, existing_storage, open_storage
 from armscan.sweeps.study.study import is_ours
 from armscan.utils.text import counted
 
+NOT_ALONE = (
+    "a training of the final evaluation cannot be stopped alone, because that would decide the result: stop the study"
+)
 STOPPED_BY = "at {:%Y-%m-%d %H:%M:%S} by {}"
 
 
@@ -84,10 +87,7 @@ def stop_trial(uri: str, name: str, number: int) -> str:
         StudyError: If there is no such trial, it has ended, or it is a training of the final evaluation.
     """
     if name.endswith(FINAL_SUFFIXES):
-        raise StudyError(
-            f"the run belongs to {name}, but a training of the final evaluation cannot be stopped alone, because that "
-            "would decide the result: stop the study"
-        )
+        raise StudyError(f"the run belongs to {name}, but {NOT_ALONE}")
     storage = _storage_with(uri, name)
     trials = optuna.load_study(study_name=name, storage=storage.optuna).get_trials(deepcopy=False)
     if number >= len(trials):
@@ -101,9 +101,15 @@ def stop_trial(uri: str, name: str, number: int) -> str:
 
 
 def stop_running_trial(storage: Storage, trial_id: int) -> bool:
-    """Stop a trial by its ID in the storage; return False, and do nothing, unless an armscan worker runs it."""
+    """Stop a trial by its ID in the storage; return False, and do nothing, unless an armscan worker runs it.
+
+    Raises:
+        StudyError: If it is a training of the final evaluation.
+    """
     try:
         trial = storage.optuna.get_trial(trial_id)
+        if FINALIST in trial.user_attrs:
+            raise StudyError(NOT_ALONE)
         if trial.state != TrialState.RUNNING or LEASE not in trial.user_attrs:
             return False
         storage.optuna.set_trial_user_attr(trial_id, STOP, reason())

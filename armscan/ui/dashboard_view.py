@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from armscan.config.services import MLFLOW_PORT
+from armscan.errors import StudyError
 from armscan.sweeps.storage import attribute_names as names
 
 if TYPE_CHECKING:
@@ -43,8 +44,8 @@ class DashboardView:
     Args:
         application: WSGI application of Optuna's dashboard.
         stop: Function that asks the worker of a trial, by its ID in the storage, to end it; returns whether there is a
-            worker. The button that fails a running trial calls it: the worker keeps its results, and the trial ends as
-            pruned.
+            worker, and raises `StudyError` if the trial must go on. The button that fails a running trial calls it: the
+            worker keeps its results, and the trial ends as pruned.
         mlflow: Address of MLflow's UI for the links in notes; None: the links stay as they are.
     """
 
@@ -54,9 +55,17 @@ class DashboardView:
     def __call__(self, environ: WSGIEnvironment, start_response: StartResponse) -> Iterable[bytes]:
         """Answer a request."""
         told = TELL.fullmatch(environ.get("PATH_INFO", ""))
-        if told and environ["REQUEST_METHOD"] == "POST" and self._stop(int(told[1])):
-            start_response("204 No Content", [("Content-Length", "0")])
-            return []
+        if told and environ["REQUEST_METHOD"] == "POST":
+            try:
+                if self._stop(int(told[1])):
+                    start_response("204 No Content", [("Content-Length", "0")])
+                    return []
+            except StudyError as error:
+                # As Optuna's dashboard answers, which shows the reason.
+                reason = json.dumps({"reason": str(error)}).encode()
+                head = [("Content-Type", "application/json"), ("Content-Length", str(len(reason)))]
+                start_response("409 Conflict", head)
+                return [reason]
         if environ["REQUEST_METHOD"] != "GET" or not STUDIES.fullmatch(environ.get("PATH_INFO", "")):
             return self._application(environ, start_response)
         answered: list[tuple[str, list[tuple[str, str]]]] = []

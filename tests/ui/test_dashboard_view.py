@@ -1,11 +1,13 @@
 """The view of armscan's trials in Optuna's dashboard."""
 
 import json
+import urllib.error
 import urllib.request
 
 import optuna
 import pytest
 
+from armscan.sweeps.storage.attribute_names import FINALIST
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.dashboard import LOCAL_UI, note_run, table_of_seeds
 from armscan.ui.servers import start_dashboard
@@ -114,6 +116,19 @@ def test_button_that_fails_a_trial_asks_its_worker_to_end_it(tmp_path):
     asked = fail_trial(storage, tmp_path, trial)
     assert asked.state.name == "RUNNING"
     assert asked.user_attrs["stop"].startswith("at 20")
+
+
+@pytest.mark.parametrize("attributes", [{"lease": LEASE}, {}], ids=["running", "waiting"])
+def test_button_stops_no_training_of_the_final_evaluation(tmp_path, attributes):
+    storage = open_storage(str(tmp_path / "optuna.journal"))
+    trial = optuna.create_study(study_name="a-judged", storage=storage.optuna).ask()
+    for name, value in (attributes | {FINALIST: 1}).items():
+        trial.set_user_attr(name, value)
+    with pytest.raises(urllib.error.HTTPError, match="409") as refused:
+        fail_trial(storage, tmp_path, trial)
+    assert "cannot be stopped alone" in json.loads(refused.value.read())["reason"]
+    now = storage.optuna.get_trial(trial._trial_id)
+    assert (now.state.name, "stop" in now.user_attrs) == ("RUNNING", False)
 
 
 def test_button_fails_trials_of_others(tmp_path):

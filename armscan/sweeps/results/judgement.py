@@ -73,7 +73,9 @@ class Judgement:
         if self.is_repeated:
             notes.append("the test volumes were used before, with another configuration of the study")
         if names := ", ".join(map(name_of, self.others)):
-            notes.append(f"the test volumes were used before for {names}: the study went on after its end")
+            notes.append(
+                f"the test volumes were used before for {names}: the study went on after its judgement had begun"
+            )
         return [*notes, *(volume_notes(self.results[0].figures) if self.results else ())]
 
     @property

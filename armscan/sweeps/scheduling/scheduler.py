@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Mapping, Sequence
-from itertools import filterfalse
 from typing import Any
 
 import optuna
@@ -39,6 +38,8 @@ from armscan.sweeps.storage.storage import Storage
 
 # Optuna's system attributes: the values of an enqueued trial, and the prefix of those that its halving pruners write.
 FIXED_PARAMS, RUNG = "fixed_params", "completed_rung_"
+# Why a waiting trial was dropped.
+NOT_NEEDED = "the study no longer needs it: its configuration, or its candidates, have changed"
 Plan = Callable[[], Sequence[PlannedTrial]]
 
 
@@ -52,8 +53,9 @@ class TrialScheduler:
         plan: Function that returns the trials to enqueue next, derived from the storage. Default: None, Optuna's
             sampler proposes the trials.
         termination: Ends the study before its last trial. Default: None, nothing does.
-        is_current: Function that returns whether a trial is still wanted; others are not run, and their failures do not
-            count. Default: None, all are.
+        is_current: Function that returns whether the failure of a trial counts. Default: None, all do.
+        unwanted: Function that returns those of the waiting trials that are no longer needed, and are not run.
+            Default: None, all are needed.
     """
 
     def __init__(
@@ -65,10 +67,11 @@ class TrialScheduler:
         *,
         termination: Termination | None = None,
         is_current: Callable[[FrozenTrial], bool] | None = None,
+        unwanted: Callable[[Sequence[FrozenTrial]], Sequence[FrozenTrial]] | None = None,
     ) -> None:
         self.study, self.storage = study, storage
         self.limits, self._plan = limits, plan
-        self._is_current = is_current
+        self._is_current, self._unwanted = is_current, unwanted
         self.termination = termination
         # When and by whom the study was stopped, as far as this process knows; see `read_stop_request`.
         self.stopped = ""
@@ -112,12 +115,12 @@ class TrialScheduler:
         return self.storage.exclusive(claimed)
 
     def _drop_waiting(self) -> None:
-        """Fail the waiting trials that are not wanted any more; they count nowhere."""
-        if self._is_current is None:
+        """Fail the waiting trials that are no longer needed; they count nowhere."""
+        if self._unwanted is None:
             # A search reads its trials only once for a claim.
             return
-        for trial in filterfalse(self._is_current, self.state().waiting):
-            for name, value in ((RETRIED, True), (DROPPED, True), (FAILURE, "the study has another configuration")):
+        for trial in self._unwanted(self.state().waiting):
+            for name, value in ((RETRIED, True), (DROPPED, True), (FAILURE, NOT_NEEDED)):
                 self.study._storage.set_trial_user_attr(trial._trial_id, name, value)
             self.study._storage.set_trial_state_values(trial._trial_id, TrialState.FAIL)
 

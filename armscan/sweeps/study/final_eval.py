@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import takewhile
@@ -195,7 +195,8 @@ class FinalEvaluation:
         return [name for name in is_blocked if is_blocked[name]]
 
     def _planned(self, trainings: Iterable[tuple[int, int]], study: optuna.Study) -> list[PlannedTrial]:
-        begun = set(map(training_of, self._counted_trials(study)))
+        # The retry of an attempt counts for itself: it may have failed, and a later start ignores that.
+        begun = {training_of(trial) for trial in self._counted_trials(study) if RETRIED not in trial.user_attrs}
         searched = self.search.get_trials(deepcopy=False)
         # A command with another configuration has taken over the study.
         if config_sha256_of(self.search) != self.config_sha256:
@@ -206,6 +207,17 @@ class FinalEvaluation:
             for number, seed in trainings
             if (number, seed) not in begun
         ]
+
+    def unwanted_of_selection(self, waiting: Sequence[FrozenTrial]) -> list[FrozenTrial]:
+        """Return the waiting trainings of the selection that it no longer needs; see `TrialScheduler`."""
+        return self._unwanted(waiting, self.contenders() if waiting else ())
+
+    def unwanted_of_judgement(self, waiting: Sequence[FrozenTrial]) -> list[FrozenTrial]:
+        """Return the waiting trainings of the judgement that it no longer needs; see `TrialScheduler`."""
+        return self._unwanted(waiting, to_judge(self.race()) if waiting else ())
+
+    def _unwanted(self, waiting: Sequence[FrozenTrial], wanted: Collection[int]) -> list[FrozenTrial]:
+        return [trial for trial in waiting if not self.is_current(trial) or training_of(trial)[0] not in wanted]
 
     def is_current(self, trial: FrozenTrial) -> bool:
         """Return whether a final training has the study's configuration; without a checksum, it counts as if it had."""

@@ -177,7 +177,12 @@ def _final_phases(search: Phase, settings: StudySettings, task: Task, final: Fin
         shared(
             name=final.selection.study_name,
             scheduler=TrialScheduler(
-                final.selection, storage, limits, final.missing_of_selection, is_current=final.is_current
+                final.selection,
+                storage,
+                limits,
+                final.missing_of_selection,
+                is_current=final.is_current,
+                unwanted=final.unwanted_of_selection,
             ),
             run=task.validate,
             folder=search.folder / "selection",
@@ -185,7 +190,12 @@ def _final_phases(search: Phase, settings: StudySettings, task: Task, final: Fin
         shared(
             name=final.judgement.study_name,
             scheduler=TrialScheduler(
-                final.judgement, storage, limits, final.missing_of_judgement, is_current=final.is_current
+                final.judgement,
+                storage,
+                limits,
+                final.missing_of_judgement,
+                is_current=final.is_current,
+                unwanted=final.unwanted_of_judgement,
             ),
             objectives=(task.final_metric,),
             run=task.evaluate,

@@ -159,6 +159,8 @@ def _train(attempt: Attempt, seed: int, conclude: Conclude | None = None) -> dic
         setup, tracked, earlier = _start_or_resume(attempt, setup, config, choices, folder)
         attempt.opened(tracked)
         with tracked:
+            if earlier is None:
+                earlier = begin_generation(attempt, setup, folder, run_id=tracked.run_id)
             try:
                 result = train_agent(
                     setup,
@@ -208,8 +210,12 @@ def _tags_of(attempt: Attempt, folder: Path) -> dict[str, str]:
 
 def _start_or_resume(
     attempt: Attempt, setup: RunSetup, config: DictConfig, choices: dict[str, str], folder: Path
-) -> tuple[RunSetup, TrackedRun, list[EpochReport]]:
-    """Open the tracked run of a training, and restore the agent as an earlier attempt left it."""
+) -> tuple[RunSetup, TrackedRun, list[EpochReport] | None]:
+    """Open the tracked run of a training, and restore the agent as an earlier attempt left it.
+
+    Returns:
+        The setup of the run, the tracked run, and the reports of the epochs so far; None if none has ended.
+    """
     agent = setup.agent
     assert isinstance(agent, Learner)
     if found := _begun(folder, attempt, config):
@@ -226,12 +232,12 @@ def _start_or_resume(
                 return setup, reopen(), earlier
         elif not any(name.startswith("validation/") for name in run.data.metrics):
             # It was interrupted before the end of its first epoch.
-            return setup, reopen(), begin_generation(attempt, setup, folder, run_id=run.info.run_id)
+            return setup, reopen(), None
     job = Job(attempt.trial.number, " ".join(attempt.overrides), "", attempt.run_id, attempt.study_folder)
     invocation = Invocation(folder, attempt.overrides, attempt.command, choices, job)
     tracked = start_tracking(config, invocation, setup, tags=attempt.tags, retry_s=RETRY_S)
     atomic_write(folder / RUN_FILE, json.dumps({"run_id": tracked.run_id}))
-    return setup, tracked, begin_generation(attempt, setup, folder, run_id=tracked.run_id)
+    return setup, tracked, None
 
 
 def _begun(folder: Path, attempt: Attempt, config: DictConfig) -> tuple[TrackingStore, Run] | None:

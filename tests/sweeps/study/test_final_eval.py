@@ -21,10 +21,10 @@ from armscan.sweeps.results.selection import candidates_of
 from armscan.sweeps.results.study_run import COMPARISONS, best_metrics, result_note
 from armscan.sweeps.scheduling.limits import Limits
 from armscan.sweeps.scheduling.population import searched_values
-from armscan.sweeps.scheduling.scheduler import TrialScheduler
+from armscan.sweeps.scheduling.scheduler import NOT_NEEDED, TrialScheduler
 from armscan.sweeps.scheduling.state import CONTROL
 from armscan.sweeps.stop import stop_trial
-from armscan.sweeps.storage.attribute_names import FINALIST, GENERATION, MEMBER, METRICS, SCHEDULE
+from armscan.sweeps.storage.attribute_names import FINAL_SEED, FINALIST, GENERATION, MEMBER, METRICS, SCHEDULE
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.candidates import training_of
 from armscan.sweeps.study.final_eval import n_trainings
@@ -68,14 +68,18 @@ def searched(uri, objectives=("mean_steps",), fixed=None, constraints=(), **chan
     return storage, asked, search
 
 
-def opened(uri, **changes):
+def opened(uri, max_retries=10, **changes):
+    """Open a final evaluation, whose trainings may lose their workers several times; return it, and its schedulers."""
     storage, asked, search = searched(uri, **changes)
     final = open_final_eval(storage, asked, search, None)
-    # A training may lose its worker several times.
-    limits = Limits(n_trials=10**9, max_retries=10)
-    plans = {final.selection: final.missing_of_selection, final.judgement: final.missing_of_judgement}
+    limits = Limits(n_trials=10**9, max_retries=max_retries)
+    phases = (
+        (final.selection, final.missing_of_selection, final.unwanted_of_selection),
+        (final.judgement, final.missing_of_judgement, final.unwanted_of_judgement),
+    )
     return final, [
-        TrialScheduler(study, storage, limits, plan, is_current=final.is_current) for study, plan in plans.items()
+        TrialScheduler(study, storage, limits, plan, is_current=final.is_current, unwanted=unwanted)
+        for study, plan, unwanted in phases
     ]
 
 
@@ -445,6 +449,40 @@ def test_final_evaluation_that_failed_is_run_again_once_it_is_started_again(stor
     assert final.blocked() == []
 
 
+@pytest.mark.parametrize("phase", [0, 1], ids=["selection", "judgement"])
+def test_training_whose_worker_and_that_of_its_retry_died_is_run_again_after_a_restart(storage_uri, phase):
+    final, schedulers = opened(storage_uri, max_retries=1)
+    if phase == 1:
+        while trial := schedulers[0].claim({"worker": "a"}):
+            end(schedulers[0], trial, TRUE)
+    scheduler = schedulers[phase]
+    while trial := scheduler.claim({"worker": "a"}):
+        scheduler.renew(trial, {"env_steps": 100})
+        scheduler.reclaim(lambda _: True)
+    assert final.blocked() == [scheduler.study.study_name]
+    assert scheduler.reset_failures(is_blocked=True)
+    final = run(storage_uri)
+    assert (judge(final).n_seeds, final.n_unjudged) == (FINAL_EVAL["judge_seeds"], 0)
+
+
+def test_trainings_that_wait_are_dropped_once_another_configuration_is_chosen(storage_uri):
+    final, (selection, judgement) = opened(storage_uri)
+    while trial := selection.claim({"worker": "a"}):
+        end(selection, trial, TRUE)
+    # All trainings of the judgement wait, and the study goes on.
+    judgement.requeue(judgement.claim({"worker": "a"}), {"worker": "a"})
+    trial = final.search.ask()
+    trial.suggest_float("agent.lr", 1e-4, 1e-2)
+    trial.set_user_attr(METRICS, {"mean_steps": 0.5, "success_rate": 0.5})
+    final.search.tell(trial, 0.5)
+    # Trial 1 is a candidate no more, and it has trainings that wait.
+    selection.study.enqueue_trial({}, user_attrs={FINALIST: 1, FINAL_SEED: 1005})
+    final = run(storage_uri, true=TRUE | {3: 0.5})
+    assert (judge(final).chosen, judge(final).others) == (3, ())
+    assert {number for number, _ in trained(final.judgement)} == {CONTROL, 3}
+    assert (1, 1005) not in trained(final.selection)
+
+
 def test_trainings_of_an_earlier_configuration_of_the_study_are_run_again(storage_uri):
     first = run(storage_uri)
     assert judge(first).differences[0].paired.value < -2.5
@@ -524,8 +562,8 @@ def test_configuration_that_is_changed_back_trains_what_the_other_dropped(storag
     assert final.race().chosen == 1
     dropped = [trial for trial in final.selection.trials if trial.state == TrialState.FAIL]
     told = {row["cause"] for row in _ending_rows(dropped)}
-    assert {"the study has another configuration"} <= told
-    assert "the study has another configuration, retried" not in told
+    assert NOT_NEEDED in told
+    assert f"{NOT_NEEDED}, retried" not in told
 
 
 def test_difference_counts_volumes_of_one_arm_once(storage_uri, monkeypatch):

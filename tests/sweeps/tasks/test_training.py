@@ -8,10 +8,11 @@ from omegaconf import OmegaConf
 
 from armscan.config.compose import compose_run
 from armscan.config.defaults import to_plain
+from armscan.errors import CheckpointError
 from armscan.experiment.build import set_up
 from armscan.sweeps.tasks import training
 from armscan.sweeps.tasks.attempt import over_seeds
-from armscan.sweeps.tasks.training import _adopt, _begun_in, _start_or_resume
+from armscan.sweeps.tasks.training import _adopt, _begun_in, _start_or_resume, _train
 from armscan.tracking import open_store
 from tests.support import FEW_VOLUMES
 
@@ -97,7 +98,7 @@ def test_training_that_was_interrupted_before_its_first_epoch_goes_on_in_its_run
     ids = []
     for _ in range(2):
         _, tracked, earlier = _start_or_resume(attempt, setup, config, choices, tmp_path)
-        assert earlier == []
+        assert earlier is None
         tracked.end_requeued()
         ids.append(tracked.run_id)
     assert ids[0] == ids[1]
@@ -106,6 +107,34 @@ def test_training_that_was_interrupted_before_its_first_epoch_goes_on_in_its_run
     _, tracked, _ = _start_or_resume(attempt, setup, config, choices, tmp_path)
     tracked.end_requeued()
     assert tracked.run_id != ids[0]
+
+
+@pytest.mark.usefixtures("database")
+def test_run_of_a_generation_whose_parent_left_nothing_fails_with_that_reason(tmp_path):
+    config, choices = compose_run([*("sweep=sac_y", *FEW_VOLUMES), f"tracking.artifacts={tmp_path}/artifacts"])
+    client, experiment_id = open_store(**to_plain(config.tracking))
+    opened = []
+    attempt = SimpleNamespace(
+        run_id=client.create_run(experiment_id, name="trial", tags={"study": "a"}).info.run_id,
+        tags={"study": "a"},
+        trial=SimpleNamespace(number=1),
+        folder=tmp_path / "0001",
+        folders_before=(),
+        parent_folder=tmp_path / "0000",
+        interval=(400, 800),
+        overrides=[],
+        command="",
+        study_folder=tmp_path,
+        config=lambda _: (config, choices),
+        opened=opened.append,
+        objectives=(),
+        seeds_done={},
+    )
+    with pytest.raises(CheckpointError, match="the next generation needs"):
+        _train(attempt, 0)
+    run = client.get_run(opened[0].run_id)
+    assert run.info.status == "FAILED"
+    assert "the next generation needs" in run.data.tags["failure"]
 
 
 def test_trial_reports_and_returns_the_same_figure_over_its_seeds():
