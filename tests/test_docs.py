@@ -93,6 +93,9 @@ def in_a_folder(tmp_path, monkeypatch):
         (tmp_path / folder).mkdir(parents=True)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
+    # Of commands for a cluster.
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://mlflow:5000")
+    monkeypatch.setenv("ARMSCAN_STORAGE", "postgresql://optuna@database/optuna")
     return tmp_path
 
 
@@ -100,6 +103,7 @@ def in_a_folder(tmp_path, monkeypatch):
 @pytest.mark.parametrize(("page", "words"), COMMANDS)
 def test_commands_of_pages_are_valid(page, words, in_a_folder):
     from armscan.config.compose import compose
+    from armscan.experiment.build import check_config
 
     write_files(page, in_a_folder)
     words = [filled_in(word) for word in words]
@@ -110,7 +114,18 @@ def test_commands_of_pages_are_valid(page, words, in_a_folder):
             command = command.commands[name]
         command.make_context(" ".join(path), words[len(path) :])
     elif not any(word.startswith("resume=") for word in words):
-        assert compose(list(of_each_sweep([word for word in words[1:] if word not in OF_HYDRA])))
+        check_config(compose(list(of_each_sweep([word for word in words[1:] if word not in OF_HYDRA]))))
+
+
+@pytest.mark.full
+def test_study_of_the_page_on_docker_is_valid():
+    from armscan.config.compose import compose
+    from armscan.experiment.build import check_config
+
+    sweep, words = re.search(
+        r"^ARMSCAN_SWEEP=(.*)\n(?:.*\n)*?ARMSCAN_WORDS=(.*)", (DOCS / "docker.md").read_text(), re.M
+    ).groups()
+    check_config(compose([f"sweep={sweep}", *shlex.split(words)]))
 
 
 def write_files(page, folder):

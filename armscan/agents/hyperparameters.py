@@ -52,7 +52,9 @@ class Parameters:
     """Learning rate of the networks."""
 
     lr_end_factor: float = number(1.0, at_least=0.0, at_most=1.0)
-    """Final learning rate as a fraction of `lr`, reached linearly. Default: 1, constant."""
+    """Learning rate at the end as a fraction of `lr`, approached linearly: it is set at the start of each epoch.
+    Default: 1, constant.
+    """
 
     batch_size: int = 256
     """Number of transitions, or slices, in one gradient step."""
@@ -74,7 +76,7 @@ class PolicyParameters(Parameters):
     """Hyperparameters of every algorithm whose policy explores while it learns."""
 
     deterministic_eval: bool = True
-    """Whether evaluations take deterministic actions, see `Policy`. False: they sample actions, as training does."""
+    """Whether evaluations take deterministic actions, by the Gaussian's mean. False: they sample as trainings do."""
 
 
 def round_up(n_env_steps: int, num_envs: int) -> int:

@@ -90,7 +90,8 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
             `armscan.anatomy.Tissues`. Default: `pixels`.
         success_threshold: Threshold of success, in (0, 1]: a plane whose reward is above -success_threshold succeeds.
             Default: 0.05.
-        ends: Event that ends an episode before `max_steps`: `on_reward`, `on_budget` (none) or `on_stop`; see above.
+        ends: Event that ends an episode before `max_steps`: `on_reward`, the first success; `on_budget`, none;
+            `on_stop`, the agent's `stop`, a further component of its action. The last plane is judged.
             Default: `on_reward`.
         max_steps: Number of steps after which an episode is truncated, 1 or more. Default: 50.
         start: Plane at the start, `middle` or `random`. Default: `middle`.

@@ -126,7 +126,8 @@ class ClusterObservation:
     raw form has the plain numbers, the centre in pixels. Agents learn much faster with the normalised form.
 
     Args:
-        normalised: Whether to return the normalised form; False: the raw one. Default: True.
+        normalised: Whether to return the normalised form; False: the raw one, as published, with which agents learn
+            much more slowly. Default: True.
         targets: Divisors of the counts. Default: None, (4, 3, 1).
     """
 

@@ -32,8 +32,8 @@ class RandomTransform:
     """Random motion and deformation of a volume at reset, each component drawn uniformly.
 
     Deformations make other wrists of one: they are centred on the labelled slice, keep the labelled plane fixed, and
-    cost nothing, because the lookup of a slice applies them. The pixel size does not change, so that a larger wrist has
-    larger landmarks, in pixels as in mm.
+    cost nothing, because the lookup of a slice applies them. Trainings have them, evaluations do not. The pixel size
+    does not change, so that a larger wrist has larger landmarks, in pixels as in mm.
 
     Args:
         rz_deg: Largest rotation about Z, in degrees, in both directions, from 0 to 180. Default: 10.
@@ -42,12 +42,14 @@ class RandomTransform:
         ty_mm: Largest translation along Y, in mm, in both directions, from 0 to 10,000. Default: 10.
         centre: Fixed point of the rotation: `middle` of the volume, or `first_voxel`, as published, which moves the
             hand out of the picture. Default: `middle`.
-        scale: Largest relative change of the volume's size, the same in all directions, from 0 to 0.3. Default: 0.
+        scale: Largest relative change of the volume's size, the same in all directions, from 0 to 0.3; in trainings
+            alone. Default: 0.
         stretch: Largest relative change of its size across, along the labelled normal and in depth, each drawn
-            separately, from 0 to 0.3. Default: 0.
+            separately, from 0 to 0.3; in trainings alone. Default: 0.
         shear: Largest shear, in mm of shift per mm along another axis, from 0 to 0.3: across and depth shift with the
-            position along the labelled normal, and with each other. Default: 0.
-        mirror: Whether to mirror the volume with probability 0.5, so that it shows the other hand. Default: False.
+            position along the labelled normal, and with each other; in trainings alone. Default: 0.
+        mirror: Whether to mirror the volume with probability 0.5, so that it shows the other hand; in trainings alone.
+            Default: False.
 
     Raises:
         InvalidValueError: If a value is out of its range.

@@ -214,10 +214,11 @@ def _check_data(data: DictConfig) -> None:
     takes = inspect.signature(get_method(target)).parameters
     if any(each.kind is each.VAR_KEYWORD for each in takes.values()):
         return
-    if unknown := [key for key in map(str, data) if not key.startswith("_") and key not in takes]:
+    if unknown := [f"data.{key}" for key in map(str, data) if not key.startswith("_") and key not in takes]:
+        left_out = " ".join(f"'~{key}'" for key in unknown)
         raise InvalidValueError(
-            f"data.{unknown[0]} is set, but this data has no such key, only {listed(takes)}: perhaps the experiment is "
-            "for another choice of data"
+            f"{unknown[0]} is set, but this data has no such key, only {listed(takes)}. If an experiment or a sweep "
+            f"sets it for another choice of data, leave it out: {left_out}"
         )
 
 

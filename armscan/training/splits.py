@@ -107,7 +107,8 @@ def phantom_data(
         n_test: Number of test phantoms, 1 or more. Default: 8.
         first_seed: Seed of the first training phantom, 0 or more; the next ones follow. Default: 0.
         cache_dir: Folder that keeps phantoms. Default: None, the user's cache folder.
-        version: Version of the phantoms, 1 or 2; see `make_phantom`. Default: 1, as in runs that name none.
+        version: Version of the phantoms. 1: the labelled plane has a fixed position among bones and tendons; 2: its
+            position varies. Default: 1, as in runs that name none.
 
     Raises:
         InvalidValueError: If a number is out of range.
@@ -201,7 +202,7 @@ def mixed_data(
         n_test: Number of test phantoms, with `test=phantoms`, 1 or more. Default: 8.
         first_seed: Seed of the first training phantom, 0 or more; the next ones follow. Default: 0.
         cache_dir: Folder that keeps phantoms. Default: None, the user's cache folder.
-        version: Version of the phantoms; see `phantom_data`. Default: 1.
+        version: Version of the phantoms, 1 or 2; see `phantom_data`. Default: 1.
         validation: Validation volumes; see `nifti_data`. `phantoms` uses no subjects. Default: `phantoms`, as in runs
             that name none.
         test: Test volumes; see `nifti_data`. `phantoms` uses no subjects. Default: `phantoms`, as in runs that name

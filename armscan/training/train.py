@@ -56,11 +56,12 @@ class Budget:
     Args:
         env_steps: Largest number of environment steps, 1 or more; rounded up to the number that the agent takes at
             once.
-        eval_every_env_steps: Environment steps between two validations, 1 or more; rounded up in the same way.
+        eval_every_env_steps: Environment steps between two validations, 1 or more; rounded up in the same way. A
+            validation cuts off unfinished episodes, so at least the environments times the steps of an episode.
         validation_episodes: Number of episodes of each validation, 1 or more.
         solved: Criterion that stops the training early. Default: None, the whole budget is used.
-        best_by: Criterion that chooses the best epoch, `success` or `distance`; see `Evaluation.score`. Default:
-            `success`.
+        best_by: Criterion that chooses the best epoch: `success`, the highest rate, then the fewest steps; or
+            `distance`, the least sum of mean distance in mm and mean angle in degrees. Default: `success`.
         schedule: Changes of the agent's hyperparameters, a mapping for each: `from_env_steps` and values by keys, such
             as `agent.lr`. Each applies from the first epoch that begins at or after `from_env_steps`; a value lasts
             until another change of it. Default: None, no changes.

@@ -77,7 +77,8 @@ def of_study(key: str) -> tuple[str, str]:
     if field is None:
         return "", ""
     of_type = field.annotation.__name__ if inspect.isclass(field.annotation) else str(field.annotation)
-    of_type = "dict" if field.annotation is Space else of_type.replace("None", "null")
+    # A target and its arguments, as `study.terminator` has them.
+    of_type = "dict" if field.annotation is Space or "Mapping" in of_type else of_type.replace("None", "null")
     return of_type, f"Allowed: {field.description}." if field.description else ""
 
 
@@ -111,7 +112,8 @@ def rows(keys: CommentedMap, source: list[str], prefix: str) -> Iterator[tuple[s
         elif not str(value).startswith("${"):
             of_type, allowed = of_study(f"{prefix}{key}".removeprefix(STUDY)) if prefix.startswith(STUDY) else ("", "")
             text = in_yaml(texts[key]) if texts.get(key) else beside[key]
-            words = " ".join(f"{text} {ranges.get(key, allowed)}".split())
+            changes = "A schedule can change it." if key in getattr(target, "SCHEDULABLE", ()) else ""
+            words = " ".join(f"{text} {ranges.get(key, allowed)} {changes}".split())
             yield f"{prefix}{key}", types.get(key) or kind(value) or of_type, shown(value), words
 
 

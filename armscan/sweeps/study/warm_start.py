@@ -115,7 +115,7 @@ def _of_preset(space: Space, name: str, overrides: Sequence[str]) -> InitialTria
     chosen, misfit = values_of(space, overrides if name == DEFAULT else [f"experiment={name}"])
     if misfit:
         return InitialTrials(PRESET.format(name), f"preset {name} is not tried: {misfit}")
-    message = f"preset {name} is tried first: {' '.join(overrides_of(chosen))}"
+    message = f"of preset {name}, the searched values are tried first: {' '.join(overrides_of(chosen))}"
     return InitialTrials(PRESET.format(name), message, (), (chosen,))
 
 

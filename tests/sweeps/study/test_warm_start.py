@@ -170,7 +170,9 @@ def test_preset_whose_values_lie_in_the_space_is_tried_first():
     assert own.enqueued[0]["agent.lr_end_factor"] == 1.0
     other = {"agent.lr_end_factor": 0.1, "stack": 4, "memory": 2, "agent.target_entropy_per_dim": -3.0}
     assert best.enqueued == (own.enqueued[0] | other,)
-    assert best.message.startswith("preset best_zy is tried first: agent.lr=0.001 agent.lr_end_factor=0.1 ")
+    assert best.message.startswith(
+        "of preset best_zy, the searched values are tried first: agent.lr=0.001 agent.lr_end_factor=0.1 "
+    )
 
 
 def test_taken_trial_with_the_values_of_the_control_is_no_candidate_beside_it(study_in):
