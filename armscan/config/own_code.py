@@ -15,13 +15,12 @@ from typing import Any
 from hydra.utils import get_object
 
 from armscan.config.trust import foreign_targets
-from armscan.utils.files import sha256
+from armscan.utils.files import PACKAGE_FOLDERS, sha256
 
 N_CHARS = 16
 # A longer list of checksums, which no tag could hold, is one checksum of all.
 MAX_CHARS = 4000
 ALL = "own_classes"
-PACKAGE_FOLDERS = frozenset({"site-packages", "dist-packages"})
 FUNCTIONS = ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda
 INSTALLED = tuple(Path(path) for name, path in sysconfig.get_paths().items() if name.endswith(("lib", "stdlib")))
 

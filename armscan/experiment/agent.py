@@ -23,6 +23,7 @@ from armscan.agents import (
 from armscan.config.compose import build_section
 from armscan.envs import EnvFactory
 from armscan.errors import InvalidValueError, listed
+from armscan.utils.validation import missing_members
 from armscan.volumes import LabelVolume
 
 
@@ -81,10 +82,9 @@ def _check_agent(agent: Agent, algorithm: Algorithm) -> None:
             "begin and act"
         )
     if hasattr(agent, "learn") and not isinstance(agent, Learner):
-        missing = [name for name in dir(Learner) if not name.startswith("_") and not hasattr(agent, name)]
         raise InvalidValueError(
             f"agent is {type(agent).__name__}, which learns, but it must have all methods of Learner: it has no "
-            f"{listed(missing)}"
+            f"{listed(missing_members(agent, Learner))}"
         )
 
 

@@ -24,7 +24,7 @@ from armscan.envs import EnvFactory
 from armscan.errors import InvalidValueError, listed
 from armscan.experiment.agent import make_agent, make_algorithm
 from armscan.stats.on_plane import ON_PLANE, ON_PLANE_KEY, OnPlane, check_on_plane
-from armscan.tracking import check_settings
+from armscan.tracking import TrackingSettings
 from armscan.training import Budget, CheckpointProvenance, Fingerprints, Split, TrainingDomain
 from armscan.training.domain import smallest_slice, with_crops
 from armscan.training.episode_results import Env
@@ -35,7 +35,6 @@ from armscan.volumes import LabelVolume
 SECTIONS = ("data", "obs", "reward", "agent", "network", "tracking", "env", "training", "evaluation", "compute")
 SINGLE_KEYS = ("projection", "stack", "memory", "stack_exclude", "stack_memory", "seed", "device")
 EVALUATION_KEYS = ("episodes", "on_plane")
-TRACKING_KEYS = ("uri", "experiment", "artifacts", "wait_s", "system_metrics_s", "policy")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -258,11 +257,10 @@ def check_keys(config: DictConfig) -> None:
     for node, where, allowed in (
         (config, "at the top", (*SECTIONS, *SINGLE_KEYS, CLUSTER)),
         (config.evaluation, "in evaluation", EVALUATION_KEYS),
-        (config.tracking, "in tracking", TRACKING_KEYS),
     ):
         if unread := [key for key in node if key not in allowed]:
             raise InvalidValueError(f"there is no key {unread[0]!r} {where}, but only {listed(allowed)}")
-    check_settings(**to_plain(config.tracking))
+    TrackingSettings.read("tracking", to_plain(config.tracking))
 
 
 def check_sections(config: DictConfig) -> None:

@@ -32,7 +32,7 @@ from armscan.experiment.job import (
 )
 from armscan.launch.grid_jobs import shared_overrides
 from armscan.launch.launchers import LAUNCHER, ON_THIS_MACHINE, check_launcher, prepare_launcher
-from armscan.tracking import TrackingStore, begin_outbox, code_state, note_end, open_store, sync
+from armscan.tracking import TrackingSettings, TrackingStore, begin_outbox, code_state, note_end, open_store, sync
 from armscan.tracking.sync import PROCESS_DIED
 from armscan.tracking.tags import CONTINUED_TAG, FAILURE_TAG, FOLDER_TAG, GRID_TAG, JOB_TAG
 from armscan.utils.processes import ProcessInfo
@@ -87,6 +87,7 @@ class Multirun(Callback):
         if not isinstance(config.tracking, DictConfig):
             raise InvalidValueError(f"tracking is {config.tracking!r}, but it must be a section, such as its default")
         tracking = to_plain(config.tracking)
+        TrackingSettings.read("tracking", tracking)
         overrides = list(config.hydra.overrides.task)
         client, experiment_id = open_store(**tracking)
         (folder / OUTCOME_FOLDER).mkdir(parents=True)

@@ -93,7 +93,7 @@ def write_comparison(groups: Sequence[Group], left_out: Sequence[TrackedTraining
     parts = [
         f"<p><strong>{html.escape(final.headline)}</strong></p>" if final.headline else "",
         _summary(groups),
-        notes_on(groups, left_out, curves, has_other_volumes=has_other_volumes),
+        notes_on(groups, left_out, curves, reached, has_other_volumes=has_other_volumes),
         *_learning(groups, curves),
         *_final(groups, reached, replace(final, headline=""), baselines),
         *_better(groups, pairs),

@@ -14,6 +14,7 @@ from armscan.reports.significance import evaluations_by_seed
 from armscan.stats.aggregation import MIN_SEEDS
 from armscan.tracking.tags import OWN_CODE_TAG
 from armscan.training.headline import MIN_SUBJECTS
+from armscan.training.metrics import MetricEstimates
 from armscan.utils.run_files import ID_CHARS
 
 # From this number of seeds on, the intervals of final figures are nearly as wide as they should be.
@@ -21,7 +22,12 @@ MANY_SEEDS = 5
 
 
 def notes_on(
-    groups: Sequence[Group], left_out: Sequence[TrackedTraining], curves: Curves, *, has_other_volumes: bool
+    groups: Sequence[Group],
+    left_out: Sequence[TrackedTraining],
+    curves: Curves,
+    reached: Sequence[MetricEstimates | None],
+    *,
+    has_other_volumes: bool,
 ) -> str:
     """Return the notes as a list, nothing if there are none.
 
@@ -29,12 +35,13 @@ def notes_on(
         groups: Groups to compare.
         left_out: Trainings that repeat another one.
         curves: Learning curves of the groups.
+        reached: Final metrics of each group; None if none of its trainings was tested.
         has_other_volumes: Whether groups were tested on different volumes.
     """
     notes = [
         *_on_folds(groups),
         *_on_seeds(groups),
-        *_on_subjects(groups),
+        *_on_subjects(groups, reached),
         *_on_unfinished(groups),
         *_on_missing(groups),
         *_on_curves(groups, curves),
@@ -82,12 +89,9 @@ def _on_seeds(groups: Sequence[Group]) -> Iterator[str]:
         )
 
 
-def _on_subjects(groups: Sequence[Group]) -> Iterator[str]:
-    n_subjects = {}
-    for group in groups:
-        played = [episode for each in evaluations_by_seed(group).values() for episode in each.episodes]
-        n_subjects[group.number] = len({episode.subject or episode.volume for episode in played})
-    if few := [number for number, n in n_subjects.items() if 0 < n < MIN_SUBJECTS]:
+def _on_subjects(groups: Sequence[Group], reached: Sequence[MetricEstimates | None]) -> Iterator[str]:
+    tested = [(group.number, each.n_subjects) for group, each in zip(groups, reached, strict=True) if each is not None]
+    if few := [number for number, n_subjects in tested if 0 < n_subjects < MIN_SUBJECTS]:
         what = f"fewer than {MIN_SUBJECTS} test subjects: the intervals are too narrow for other subjects"
         yield f"{_numbered(few, groups)}: {what}."
 

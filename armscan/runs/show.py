@@ -17,7 +17,6 @@ from armscan.errors import in_one_line, printable
 from armscan.experiment.results import BEST_VALIDATION, LAST_VALIDATION, evaluation_table, figures_of, result_table
 from armscan.runs.rows import RunRow, artifacts_of
 from armscan.runs.run_folder import OwnFolder, RunSkippedError
-from armscan.runs.tables import format_duration
 from armscan.tracking import TrackingStore
 from armscan.tracking.tags import (
     AGENT_TAG,
@@ -34,6 +33,7 @@ from armscan.tracking.uploader import DESCRIPTION_SUM_TAG
 from armscan.utils.console import narrow_table, wide_console
 from armscan.utils.files import sha256
 from armscan.utils.run_files import BEST_CHECKPOINT, ID_CHARS, LAST_CHECKPOINT
+from armscan.utils.text import format_duration
 
 # Tags that say how a run was started; the first one that it has is shown.
 STARTED_BY = ("command", OVERRIDES_TAG)

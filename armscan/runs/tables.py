@@ -22,22 +22,10 @@ from armscan.tracking.tags import AGENT_TAG, BEST_TAG, FOLDER_TAG, HOST_TAG, OBS
 from armscan.utils.console import print_table, wide_console
 from armscan.utils.csv_file import write_csv
 from armscan.utils.run_files import ID_CHARS
-from armscan.utils.text import PERCENT, formatted
+from armscan.utils.text import MISSING, PERCENT, format_duration, formatted
 
-MISSING = "-"
 # Longest name to show; that of a grid is its command line.
 MAX_NAME_CHARS = 80
-
-
-def format_duration(seconds: float | None) -> str:
-    """Format a duration, such as 1:05:10 or 3d 4h."""
-    if seconds is None:
-        return MISSING
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    if hours >= 24:
-        return f"{hours // 24}d {hours % 24}h"
-    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
 def format_start(run: Run) -> str:

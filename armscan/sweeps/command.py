@@ -43,7 +43,7 @@ def run_study(arguments: Sequence[str], launch: Callable[[Sequence[str]], object
     launcher = compose_run(given.launching)[1][LAUNCHER]
     if launcher in ON_THIS_MACHINE:
         settings.check_workers(n_usable_cores())
-    population_of(settings, config)
+    population = population_of(settings, config)
     # Before the space is checked, which takes seconds, and before anything is created.
     storage = existing_storage(settings.storage)
     volumes = volume_sums(volumes_of(config))
@@ -62,7 +62,7 @@ def run_study(arguments: Sequence[str], launch: Callable[[Sequence[str]], object
                     "the configuration has changed: all final trainings begin anew, and use the test volumes again"
                 )
                 final = None
-        print_plan(settings, existing, final, initial)
+        print_plan(settings, population, existing, final, initial)
         return 0
     opened = open_for_work(settings, task, config, overrides, volumes=volumes)
     search = opened.search.scheduler

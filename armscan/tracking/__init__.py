@@ -15,18 +15,19 @@ from armscan.tracking.outbox import take_over
 from armscan.tracking.plots import draw_learning_curve
 from armscan.tracking.run import TrackedRun
 from armscan.tracking.sanitize import flatten, tags_of
-from armscan.tracking.store import check_artifacts, check_settings, open_existing_store, open_store
+from armscan.tracking.settings import TrackingSettings
+from armscan.tracking.store import check_artifacts, open_existing_store, open_store
 from armscan.tracking.sync import begin_outbox, fail_dead_runs, note_end, sync, upload_pending
 from armscan.tracking.tracking_store import TrackingStore
 
 __all__ = [
     "FoundRun",
     "TrackedRun",
+    "TrackingSettings",
     "TrackingStore",
     "begin_outbox",
     "check_artifacts",
     "check_run_id",
-    "check_settings",
     "check_version",
     "code_state",
     "draw_learning_curve",

@@ -14,7 +14,7 @@ from typing import Any
 
 from packaging.utils import canonicalize_name
 
-from armscan.utils.files import sha256
+from armscan.utils.files import PACKAGE_FOLDERS, sha256
 
 # Packages that a run's results may depend on; the environment file has the versions of all.
 REPORTED_PACKAGES = (
@@ -29,7 +29,6 @@ REPORTED_PACKAGES = (
     "mlflow",
     "hydra-core",
 )
-PACKAGE_FOLDERS = {"site-packages", "dist-packages"}
 PYTHON, CONSTRAINTS_SUM = "version.python", "constraints.sha256"
 UNKNOWN = "unknown"
 HEADER = re.compile(r"^(Name|Version): *(\S+)", re.MULTILINE)

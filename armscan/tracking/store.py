@@ -10,24 +10,20 @@ import warnings
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
 from urllib.parse import urlsplit
 from urllib.request import url2pathname
 
 from filelock import FileLock
 
-from armscan.config.credentials import SERVER_PASSWORD, TRACKING_PASSWORD, check_address, database_url, read_password
+from armscan.config.credentials import SERVER_PASSWORD, TRACKING_PASSWORD, database_url, read_password
 from armscan.config.trust import check_artifact_address
 from armscan.errors import TrackingError
+from armscan.tracking.settings import TrackingSettings, check_uri
 from armscan.tracking.tracking_store import TrackingStore, reason_in
 from armscan.tracking.view import VIEW, VIEW_TAG
 from armscan.utils.files import SQLITE_PREFIX, check_writable, create_database, nearest_existing, sqlite_file
-from armscan.utils.validation import check_bool, check_float
 
-EXAMPLES = {"uri": "sqlite:///mlruns.db", "experiment": "armscan", "artifacts": "mlartifacts"}
 LOCK_TIMEOUT_S = 120
-# MLflow's length limit for an experiment's name and artifact location, and how much of a longer one an error shows.
-MAX_TEXT_CHARS, N_SHOWN_CHARS = 500, 40
 # `wait_s` of a store that is opened without a configuration.
 DEFAULT_WAIT_S = 120.0
 # Report an unavailable server within seconds, not after minutes of retries.
@@ -71,14 +67,8 @@ def open_store(
         TrackingError: If the store cannot be reached or used, or a name or address is invalid.
         InvalidValueError: If another setting is invalid.
     """
-    check_settings(
-        uri,
-        experiment=experiment,
-        artifacts=artifacts,
-        wait_s=wait_s,
-        system_metrics_s=system_metrics_s,
-        policy=policy,
-    )
+    section = {"uri": uri, "experiment": experiment, "artifacts": artifacts, "wait_s": wait_s}
+    TrackingSettings.read("tracking", section | {"system_metrics_s": system_metrics_s, "policy": policy})
     connected = partial(_store, wait_s=wait_s, system_metrics_s=system_metrics_s, retry_s=retry_s)
     with store_errors(uri):
         if not uri.startswith(SQLITE_PREFIX):
@@ -97,22 +87,9 @@ def open_store(
             return store, _experiment_in(store, experiment, artifacts)
 
 
-def check_settings(
-    uri: object, *, experiment: object, artifacts: object, wait_s: Any, system_metrics_s: Any = None, policy: Any = True
-) -> None:
-    """Raise `TrackingError` or `InvalidValueError` if a setting of a store is not allowed; see `open_store`."""
-    _check_texts(uri=uri, experiment=experiment, artifacts=artifacts)
-    _check_address(str(uri))
-    check_float("tracking.wait_s", wait_s, at_least=0.0)
-    if system_metrics_s is not None:
-        check_float("tracking.system_metrics_s", system_metrics_s, above=0.0)
-    check_bool("tracking.policy", policy)
-
-
 def open_existing_store(uri: str) -> TrackingStore:
     """Open an existing tracking store without creating anything; raise `TrackingError` if there is none."""
-    _check_texts(uri=uri)
-    _check_address(uri)
+    check_uri(uri)
     if uri.startswith(SQLITE_PREFIX):
         database = sqlite_file(uri)
         if not database.is_file():
@@ -165,29 +142,6 @@ def _store(
 def absolute(uri: str) -> str:
     """Return the address of a store with an absolute path, which is valid in any working folder."""
     return f"{SQLITE_PREFIX}{sqlite_file(uri)}" if uri.startswith(SQLITE_PREFIX) else uri
-
-
-def _check_texts(**values: object) -> None:
-    for name, value in values.items():
-        if not isinstance(value, str) or not value.strip() or value == SQLITE_PREFIX:
-            raise TrackingError(f"tracking.{name} is {value!r}, but it must be a string such as {EXAMPLES[name]!r}")
-        if len(value) > MAX_TEXT_CHARS:
-            raise TrackingError(
-                f"tracking.{name} begins with {value[:N_SHOWN_CHARS]!r} and has {len(value)} characters, but it must "
-                f"have at most {MAX_TEXT_CHARS}"
-            )
-
-
-def _check_address(uri: str) -> None:
-    check_address("tracking.uri", uri)
-    try:
-        is_server = not uri.startswith("http") or (urlsplit(uri).port != 0 and bool(urlsplit(uri).hostname))
-    except ValueError:
-        is_server = False
-    if not is_server:
-        raise TrackingError(
-            f"tracking.uri is {uri!r}, but a server's address must have a host, such as http://127.0.0.1:5000"
-        )
 
 
 @contextlib.contextmanager

@@ -15,7 +15,7 @@ from rich.text import Text
 
 from armscan.training.callbacks import Callback, EpochReport
 from armscan.utils.console import print_sentence
-from armscan.utils.text import PERCENT, formatted
+from armscan.utils.text import PERCENT, format_duration, formatted
 
 
 def progress_reporter(label: str | None, measured: str) -> Callback:
@@ -89,9 +89,8 @@ class ProgressLines:
         """Print the epoch's line."""
         elapsed_s = time.perf_counter() - self._start_s
         left_s = elapsed_s * (self._total / report.n_env_steps - 1)
-        minutes, seconds = divmod(round(max(0.0, left_s)), 60)
         line = f"{report.n_env_steps:>{len(str(self._total))}}/{self._total} steps  {_summary(report)}"
-        print_sentence(f"{self._label}{line}  {minutes}:{seconds:02d} left")
+        print_sentence(f"{self._label}{line}  {format_duration(max(0.0, left_s))} left")
 
     def on_end(self) -> None:
         """Do nothing."""

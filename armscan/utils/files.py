@@ -21,6 +21,8 @@ from armscan.errors import with_causes
 UNFINISHED = "unfinished"
 # The disk is full, or the user's quota is.
 FULL_DISK = (errno.ENOSPC, errno.EDQUOT)
+# Names of the folders of installed packages.
+PACKAGE_FOLDERS = frozenset({"site-packages", "dist-packages"})
 # Prefix of the address of a database in a file.
 SQLITE_PREFIX = "sqlite:///"
 

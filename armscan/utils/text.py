@@ -7,6 +7,8 @@ from collections.abc import Iterable, Sequence
 
 # Short form of a rate.
 PERCENT = "{:.0%}"
+# Shown in place of a value that there is none of.
+MISSING = "-"
 
 
 def formatted(form: str, value: float) -> str:
@@ -46,3 +48,14 @@ def markdown_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str
     """Return a table in Markdown; its first column is aligned to the left, the others to the right."""
     lines = [columns, ["---", *("---:" for _ in columns[1:])], *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def format_duration(seconds: float | None) -> str:
+    """Format a duration, such as 1:05:10 or 3d 4h."""
+    if seconds is None:
+        return MISSING
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    if hours >= 24:
+        return f"{hours // 24}d {hours % 24}h"
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"

@@ -130,3 +130,9 @@ def is_finite(value: Any) -> bool:
         return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
     except OverflowError:
         return False
+
+
+def missing_members(made: object, protocol: type[Any]) -> list[str]:
+    """Return the names of a protocol's members that an object lacks, in the order of the protocol."""
+    names = [name for kind in reversed(protocol.__mro__) for name in vars(kind) if not name.startswith("_")]
+    return [name for name in names if not hasattr(made, name)]

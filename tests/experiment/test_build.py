@@ -86,7 +86,9 @@ class Unfinished:
 def test_build_refuses_an_agent_that_learns_but_lacks_what_training_needs(phantom, monkeypatch):
     config = config_of_sizes(phantom, monkeypatch)
     config.agent = {"_target_": "tests.experiment.test_build.Unfinished"}
-    with pytest.raises(InvalidValueError, match=r"agent is Unfinished, which learns, .* has no .*policy.* or weights"):
+    with pytest.raises(
+        InvalidValueError, match=r"agent is Unfinished, which learns, .* has no .*policy, weights,.* or load_state"
+    ):
         build_setup(config)
 
 

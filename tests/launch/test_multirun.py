@@ -10,6 +10,7 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Quote, QuotedString
 from mlflow.entities import Metric
+from omegaconf import OmegaConf
 
 from armscan import run
 from armscan.config.error_messages import one_line_message
@@ -96,6 +97,19 @@ def test_run_of_a_grid_whose_launcher_has_died_is_closed(tmp_path, database, mon
     monkeypatch.setattr(ProcessInfo, "is_alive", False)
     sync(tmp_path, lambda _: store)
     assert store.get_run(parent).info.status == "FAILED"
+
+
+def test_setting_of_tracking_that_nothing_reads_is_one_line(tmp_path, capsys):
+    choices = {"hydra/launcher": "basic", "hydra/sweeper": "basic"}
+    of_hydra = {
+        "runtime": {"choices": choices},
+        "sweep": {"dir": str(tmp_path)},
+        "overrides": {"task": [], "hydra": []},
+    }
+    tracking = {"uri": "sqlite:///a.db", "experiment": "a", "artifacts": "a", "wait_s": 1.0, "foo": 1}
+    with pytest.raises(SystemExit):
+        Multirun().on_multirun_start(OmegaConf.create({"hydra": of_hydra, "tracking": tracking}))
+    assert "error: there is no key 'foo' in tracking, but only uri" in capsys.readouterr().err
 
 
 def test_override_of_all_jobs_is_recognised_however_hydra_spells_it():

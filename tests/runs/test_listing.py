@@ -9,9 +9,9 @@ import time
 
 import pytest
 
-from armscan.runs.tables import format_duration
 from armscan.tracking.uploader import DESCRIPTION_SUM_TAG
 from armscan.utils.files import sha256
+from armscan.utils.text import format_duration
 
 DAY_S = 86400.0
 

@@ -14,30 +14,23 @@ import optuna
 from optuna.exceptions import UpdateFinishedTrialError
 from optuna.trial import FrozenTrial, Trial, TrialState
 
-from armscan.config.legacy import renamed
 from armscan.sweeps.scheduling.claim import ClaimStatus, PendingWrites, PlannedTrial, TrialOutcome
 from armscan.sweeps.scheduling.limits import Limits
-from armscan.sweeps.scheduling.state import BEAT_S, StudyState, env_steps_of
+from armscan.sweeps.scheduling.retry import fail_and_retry
+from armscan.sweeps.scheduling.state import BEAT_S, StudyState
 from armscan.sweeps.scheduling.termination import Termination
 from armscan.sweeps.storage.attribute_names import (
-    ATTEMPT,
     DROPPED,
     EARLIER_SPANS,
-    ENV_STEPS,
     FAILURE,
     HOLDER,
-    KEPT_BY_RETRY,
     LEASE,
     RESET_FAILURES,
     RETRIED,
-    RETRY_OF,
     STOP,
 )
-from armscan.sweeps.storage.reports import reports_of, store_report
 from armscan.sweeps.storage.storage import Storage
 
-# Optuna's system attributes: the values of an enqueued trial, and the prefix of those that its halving pruners write.
-FIXED_PARAMS, RUNG = "fixed_params", "completed_rung_"
 # Why a waiting trial was dropped.
 NOT_NEEDED = "the study no longer needs it: its configuration, or its candidates, have changed"
 Plan = Callable[[], Sequence[PlannedTrial]]
@@ -273,38 +266,8 @@ class TrialScheduler:
         def reclaim() -> None:
             state = self.state()
             for trial in lost(state):
-                self._fail(trial, state)
+                fail_and_retry(self.study, trial, state, max_retries=self.limits.max_retries)
                 reclaimed[trial.number] = trial
 
         self.storage.exclusive(reclaim)
         return list(reclaimed.values())
-
-    def _fail(self, trial: FrozenTrial, state: StudyState) -> None:
-        attempt, lease = trial.user_attrs.get(ATTEMPT, 0), trial.user_attrs.get(LEASE, {})
-        reason = f"its worker died: {lease.get('worker', 'unknown')} on {lease.get('host', 'an unknown host')}"
-        attributes: dict[str, Any] = {FAILURE: reason, ENV_STEPS: env_steps_of(trial)}
-        if attempt < self.limits.max_retries:
-            attributes[RETRIED] = True
-            # First, so that a death before the trial has failed loses nothing: the next worker finds the retry.
-            if not any(other.user_attrs.get(RETRY_OF) == trial.number for other in state.all):
-                kept = {name: value for name, value in trial.user_attrs.items() if name in KEPT_BY_RETRY}
-                of_retry = kept | {RETRY_OF: trial.number, ATTEMPT: attempt + 1}
-                # With the values that it was enqueued with: its worker may have died before it sampled them.
-                params = {**trial.system_attrs.get(FIXED_PARAMS, {}), **trial.params}
-                self.study.enqueue_trial(renamed(params), user_attrs=of_retry)
-            self._copy_reports(trial)
-        for name, value in attributes.items():
-            self.study._storage.set_trial_user_attr(trial._trial_id, name, value)
-        self.study._storage.set_trial_state_values(trial._trial_id, TrialState.FAIL)
-
-    def _copy_reports(self, trial: FrozenTrial) -> None:
-        """Copy the reports of a trial to its retry, which does not repeat the seeds that had finished."""
-        waiting = self.state().waiting
-        if not (retries := [each for each in waiting if each.user_attrs.get(RETRY_OF) == trial.number]):
-            return
-        storage, trial_id = self.study._storage, retries[0]._trial_id
-        for step, values in reports_of(trial).items():
-            store_report(storage, trial_id, step, values)
-        for name, value in trial.system_attrs.items():
-            if name.startswith(RUNG):
-                storage.set_trial_system_attr(trial_id, name, value)

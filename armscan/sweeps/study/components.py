@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import optuna
 from hydra.errors import HydraException, InstantiationException
@@ -29,9 +29,7 @@ from armscan.sweeps.study.settings import StudySettings
 from armscan.sweeps.study.terminators import Terminator
 from armscan.sweeps.tasks.attempt import Task
 from armscan.utils.files import nearest_existing
-
-TERMINATOR_MEMBERS = ("check", "reason")
-TASK_MEMBERS = ("metrics", "final_metric", "check", "run", "validate", "evaluate")
+from armscan.utils.validation import missing_members
 
 
 def read_settings(overrides: Sequence[str]) -> tuple[StudySettings, Task, DictConfig]:
@@ -68,20 +66,25 @@ def read_settings(overrides: Sequence[str]) -> tuple[StudySettings, Task, DictCo
     make("pruner", settings.pruner, BasePruner)
     if settings.terminator is not None:
         n_trials = None if settings.warm_start else settings.n_trials
-        make_terminator(settings).check(len(settings.objectives), len(settings.seeds), n_trials)
+        make_as("terminator", settings.terminator, Terminator).check(
+            len(settings.objectives), len(settings.seeds), n_trials
+        )
     for name, folder in (("folder", settings.folder), ("artifacts", settings.artifacts)):
         if not (there := nearest_existing(Path(folder))).is_dir():
             raise StudyError(f"study.{name} is {folder!r}, but {str(there)!r} is not a folder")
-    task: Any = make("task", settings.task, object)
-    if missing := [name for name in TASK_MEMBERS if not hasattr(task, name)]:
-        raise InvalidValueError(f"study.task is {settings.task['_target_']}, which has no {missing[0]}, as a task must")
+    of_trials, _ = reduce_to_run(config)
+    return settings, _task_of(settings, of_trials), of_trials
+
+
+def _task_of(settings: StudySettings, config: DictConfig) -> Task:
+    """Return the task of a study, which returns its objectives and the metrics of its constraints."""
+    task: Task = make_as("task", settings.task, Task)
     if not str(task.final_metric).startswith(TEST_PREFIX):
         raise InvalidValueError(
             f"study.task is {settings.task['_target_']}, whose final_metric is {task.final_metric!r}, but it must "
             f"begin with {TEST_PREFIX}, as all metrics that its evaluate returns"
         )
-    of_trials, _ = reduce_to_run(config)
-    returned = task.metrics(of_trials)
+    returned = task.metrics(config)
     for name in settings.objectives:
         if name not in returned:
             raise InvalidValueError(f"study.objectives names {name!r}, but a trial returns only {listed(returned)}")
@@ -90,28 +93,38 @@ def read_settings(overrides: Sequence[str]) -> tuple[StudySettings, Task, DictCo
             raise InvalidValueError(
                 f"study.constraints has '{constraint}', but a trial returns only {listed(returned)}"
             )
-    return settings, task, of_trials
+    return task
 
 
 def make(name: str, described: Mapping[str, Any], kind: type[Any], **arguments: Any) -> Any:
-    """Return the object of class `kind` that `study.NAME` describes; raise `InvalidValueError` if there is none."""
-    try:
-        made = instantiate(described, **arguments)
-    except InstantiationException as error:
-        raise InvalidValueError(f"study.{name} cannot be made: {reason_of(error.__cause__ or error)}") from error
+    """Return the object of Optuna's class `kind` that `study.NAME` describes.
+
+    Raises:
+        InvalidValueError: If it describes none.
+    """
+    made = _made(name, described, **arguments)
     if not isinstance(made, kind):
         raise InvalidValueError(f"study.{name} is {described['_target_']}, but it must be a {name} of Optuna")
     return made
 
 
-def make_terminator(settings: StudySettings) -> Terminator:
-    """Return the terminator of a study that has one; raise `InvalidValueError` if it describes none."""
-    assert settings.terminator is not None
-    terminator: Any = make("terminator", settings.terminator, object)
-    if missing := [name for name in TERMINATOR_MEMBERS if not hasattr(terminator, name)]:
-        target = settings.terminator["_target_"]
-        raise InvalidValueError(f"study.terminator is {target}, which has no {missing[0]}, as a terminator must")
-    return cast(Terminator, terminator)
+def make_as(name: str, described: Mapping[str, Any], protocol: type[Any]) -> Any:
+    """Return the object that `study.NAME` describes, which has all members of a protocol.
+
+    Raises:
+        InvalidValueError: If it has not.
+    """
+    made = _made(name, described)
+    if missing := missing_members(made, protocol):
+        raise InvalidValueError(f"study.{name} is {described['_target_']}, which has no {missing[0]}, as a {name} must")
+    return made
+
+
+def _made(name: str, described: Mapping[str, Any], **arguments: Any) -> object:
+    try:
+        return instantiate(described, **arguments)
+    except InstantiationException as error:
+        raise InvalidValueError(f"study.{name} cannot be made: {reason_of(error.__cause__ or error)}") from error
 
 
 def check_space(settings: StudySettings, task: Task, overrides: Sequence[str], config: DictConfig) -> None:

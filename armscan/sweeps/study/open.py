@@ -19,7 +19,7 @@ from armscan.sweeps.scheduling.termination import Termination
 from armscan.sweeps.storage.attribute_names import STUDY_RUN
 from armscan.sweeps.storage.storage import Storage, open_storage
 from armscan.sweeps.study.candidates import training_of
-from armscan.sweeps.study.components import make_terminator
+from armscan.sweeps.study.components import make_as
 from armscan.sweeps.study.constraints import constrained
 from armscan.sweeps.study.dashboard import note_run
 from armscan.sweeps.study.final_eval import FinalEvaluation
@@ -28,6 +28,7 @@ from armscan.sweeps.study.phase import OpenedStudy, Phase
 from armscan.sweeps.study.population import population_of
 from armscan.sweeps.study.settings import StudySettings
 from armscan.sweeps.study.study import fixed_config, make_study, name_objectives
+from armscan.sweeps.study.terminators import Terminator
 from armscan.sweeps.study.warm_start import values_of
 from armscan.sweeps.tasks.attempt import Task
 from armscan.tracking import TrackingStore, code_state, open_store, run_of_study
@@ -157,7 +158,8 @@ def _tracked_run(
 def _termination(settings: StudySettings, study: optuna.Study, storage: Storage) -> Termination | None:
     if settings.terminator is None:
         return None
-    terminator, objectives = make_terminator(settings), list(settings.objectives)
+    terminator: Terminator = make_as("terminator", settings.terminator, Terminator)
+    objectives = list(settings.objectives)
     return Termination(study, storage, lambda state: terminator.reason(study, objectives, state), settings.asked)
 
 

@@ -17,6 +17,7 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from armscan.errors import printable
+from armscan.sweeps.scheduling.population import Population
 from armscan.sweeps.scheduling.race import budget, round_size
 from armscan.sweeps.scheduling.state import StudyState, seconds_of
 from armscan.sweeps.scheduling.termination import ended_because
@@ -31,12 +32,17 @@ BYTES_A_MIB = 2**20
 
 
 def print_plan(
-    settings: StudySettings, study: optuna.Study | None, final: FinalEvaluation | None, initial: Sequence[InitialTrials]
+    settings: StudySettings,
+    population: Population | None,
+    study: optuna.Study | None,
+    final: FinalEvaluation | None,
+    initial: Sequence[InitialTrials],
 ) -> None:
     """Print the space, the progress and cost of a started study, and the cost of the rest.
 
     Args:
         settings: Settings of the study.
+        population: Its population; None if its trials are independent.
         study: Study of the search; None if it has not been started.
         final: Its final evaluation; None if it has not been started.
         initial: Initial trials of the study.
@@ -74,24 +80,34 @@ def print_plan(
         ended = ended or settings.limit_reason(state)
         if ended:
             console.print(printable(f"ended      {ended}"), markup=False, highlight=False)
-        _print_cost(console, settings, state, final, n_left=0 if ended else max(0, settings.n_trials - done))
+        # A trial of a population is one of the generations that its final trainings train.
+        n_parts = population.n_generations if population is not None else 1
+        n_left = 0 if ended else max(0, settings.n_trials - done)
+        _print_cost(console, settings, state, final, n_left=n_left, n_parts=n_parts)
     else:
         console.print("cost       not known before the first trial has finished")
 
 
 def _print_cost(
-    console: Console, settings: StudySettings, state: StudyState, final: FinalEvaluation | None, *, n_left: int
+    console: Console,
+    settings: StudySettings,
+    state: StudyState,
+    final: FinalEvaluation | None,
+    *,
+    n_left: int,
+    n_parts: int,
 ) -> None:
-    """Print the cost of the finished trials, and an estimate for `n_left` trials and the final evaluation."""
+    """Print the cost of the finished trials, and an estimate for `n_left` trials and the final evaluation.
+
+    A final training takes as long as `n_parts` trials.
+    """
     timed = [(trial, spent_s) for trial in state.finished if (spent_s := seconds_of(trial)) is not None]
     seconds = [spent_s for _, spent_s in timed]
     mean_s = fmean(seconds)
     spent_mib = sum(map(_size_bytes, Path(settings.folder).rglob("*"))) / BYTES_A_MIB
     # Final trainings are never pruned.
     whole_s = [spent_s for trial, spent_s in timed if trial.state == TrialState.COMPLETE]
-    # Those of a population train all generations, of which a trial is one.
-    n_generations = settings.n_trials / settings.sampler["population"] if "population" in settings.sampler else 1
-    training_s = fmean(whole_s or seconds) * n_generations / len(settings.seeds)
+    training_s = fmean(whole_s or seconds) * n_parts / len(settings.seeds)
     least, most = hours_left(settings, final, n_left=n_left, trial_s=mean_s, training_s=training_s)
     console.print(
         f"cost       {sum(seconds) / 3600:.2f} hours of workers, {state.busy_hours:.2f} hours in all, "

@@ -12,8 +12,9 @@ from armscan.agents.hyperparameters import round_up
 from armscan.agents.schedule import AGENT
 from armscan.errors import InvalidValueError, few, listed
 from armscan.sweeps.scheduling.population import Population, PopulationSampler
-from armscan.sweeps.study.components import make
+from armscan.sweeps.study.components import make, make_as
 from armscan.sweeps.study.settings import NO_PRUNER, StudySettings
+from armscan.sweeps.tasks.attempt import Task
 from armscan.sweeps.tasks.training import TrainingTask
 from armscan.utils.validation import check_int
 
@@ -51,7 +52,7 @@ def _check(settings: StudySettings, config: DictConfig, sampler: PopulationSampl
         raise InvalidValueError(f"{WITH} study/pruner=none: the worst members continue from the best")
     if len(settings.objectives) > 1:
         raise InvalidValueError(f"{WITH} one objective, but study.objectives has {len(settings.objectives)}")
-    if not isinstance(make("task", settings.task, object), TrainingTask):
+    if not isinstance(make_as("task", settings.task, Task), TrainingTask):
         raise InvalidValueError(f"{WITH} a task that trains agents, but study.task is {settings.task['_target_']}")
     for key in ("constraints", "warm_start", "enqueue"):
         if getattr(settings, key):

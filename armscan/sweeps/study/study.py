@@ -20,7 +20,7 @@ from armscan.config.own_code import own_code
 from armscan.config.trust import classes_in_groups
 from armscan.errors import StudyError
 from armscan.sweeps.scheduling.population import searched_values
-from armscan.sweeps.scheduling.state import is_feasible
+from armscan.sweeps.scheduling.state import is_feasible, loss_signs
 from armscan.sweeps.space.parameter import hydra_literal
 from armscan.sweeps.storage.attribute_names import (
     EARLIER_CONFIGS,
@@ -267,8 +267,8 @@ def best_trials(study: optuna.Study, n_best: int) -> list[FrozenTrial]:
     by_generation = sorted(trials, key=lambda trial: trial.user_attrs.get(GENERATION, 0))
     latest = {trial.user_attrs[MEMBER]: trial for trial in by_generation if MEMBER in trial.user_attrs}
     trials = list(filter(is_feasible, latest.values() or trials))
-    is_down = study.directions[0] == optuna.study.StudyDirection.MINIMIZE
-    ranked = sorted(trials, key=lambda trial: (trial.values[0] if is_down else -trial.values[0], trial.number))
+    sign, *_ = loss_signs(study.directions)
+    ranked = sorted(trials, key=lambda trial: (sign * trial.values[0], trial.number))
     different: dict[str, FrozenTrial] = {}
     for trial in ranked:
         different.setdefault(json.dumps(searched_values(trial), sort_keys=True), trial)

@@ -10,6 +10,7 @@ from optuna.trial import TrialState, create_trial
 from armscan.errors import ArmscanError
 from armscan.sweeps.results.report import write_report
 from armscan.sweeps.scheduling.limits import Limits
+from armscan.sweeps.scheduling.retry import fail_and_retry
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
 from armscan.sweeps.storage import attribute_names as names
 from armscan.sweeps.storage.attribute_names import (
@@ -65,7 +66,7 @@ def work_with(study, folder):
     scheduler.end_reason(state)
     for trial in state.running:
         LivenessCheck().is_dead(trial)
-        scheduler._fail(trial, state)
+        fail_and_retry(study, trial, state, max_retries=0)
     return write_report(study, [], folder)
 
 
