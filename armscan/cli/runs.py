@@ -88,10 +88,10 @@ def list_runs(form: str, children: bool, tracking: str, sort: str, limit: int | 
     from armscan.runs.rows import collapse, sort_rows
     from armscan.runs.tables import write_rows
 
-    with _open(tracking) as client:
-        rows = sort_rows(collapse(client, find_runs(client, **selected)), sort, limit)
+    with _open(tracking) as store:
+        rows = sort_rows(collapse(store, find_runs(store, **selected)), sort, limit)
         if not rows and form == "table":
-            print(f"no run of {client.uri} is selected")
+            print(f"no run of {store.uri} is selected")
         else:
             write_rows([each for row in rows for each in row.expanded()] if children else rows, form)
 
@@ -107,8 +107,8 @@ def show(run: str, tracking: str) -> None:
     from armscan.runs.show import show as show_run
     from armscan.tracking import find_run
 
-    with _open(tracking) as client:
-        show_run(client, find_run(client, run), tracking)
+    with _open(tracking) as store:
+        show_run(store, find_run(store, run), tracking)
 
 
 @runs.command(
@@ -132,11 +132,11 @@ def prune(what: str, apply: bool, tracking: str, sort: str, limit: int | None, *
     from armscan.runs.rows import RunRow, sort_rows
     from armscan.runs.tables import print_prune_plan
 
-    with _open(tracking) as client:
-        rows = [RunRow(client, run) for run in find_runs(client, **selected)]
-        items = plan(client, [row.run for row in sort_rows(rows, sort, limit)], what)
+    with _open(tracking) as store:
+        rows = [RunRow(store, run) for run in find_runs(store, **selected)]
+        items = plan(store, [row.run for row in sort_rows(rows, sort, limit)], what)
         if apply:
-            return remove_planned(client, items, what)
+            return remove_planned(store, items, what)
         print_prune_plan(items)
     taken = [item for item in items if item.left is None]
     freed = decimal(sum(item.n_bytes for item in taken))
@@ -168,9 +168,9 @@ def stop(target: str, storage: str, tracking: str) -> None:
     if is_study(existing_storage(storage, where="--storage"), target):
         print(stop_study(storage, target))
         return
-    with _open(tracking) as client:
+    with _open(tracking) as store:
         try:
-            run = find_run(client, target)
+            run = find_run(store, target)
         except TrackingError as error:
             raise TrackingError(f"{error}; and {storage} has no study {target!r}") from error
     if (found := target_of(run)) is None:
@@ -259,6 +259,6 @@ def _open(uri: str) -> Iterator[TrackingStore]:
     from armscan.tracking import open_existing_store
     from armscan.tracking.store import store_errors
 
-    client = open_existing_store(uri)
-    with store_errors(client.uri):
-        yield client
+    store = open_existing_store(uri)
+    with store_errors(store.uri):
+        yield store

@@ -16,7 +16,7 @@ from armscan.config.own_code import changed_modules, own_code
 from armscan.errors import CheckpointError, InvalidValueError, few
 from armscan.experiment.build import check_keys, check_sections
 from armscan.tracking.lookup import FoundRun, load_agent_run
-from armscan.tracking.tags import DOMAIN_TAG, OWN_CODE_TAG
+from armscan.tracking.tags import DOMAIN_TAG, OWN_CODE_TAG, WORKING_FOLDER_TAG
 from armscan.training import CheckpointProvenance, Fingerprints, TrainingDomain, load_weights
 
 # Keys of the section `data` that hold paths.
@@ -122,8 +122,8 @@ def changed(config: DictConfig, changes: Mapping[str, Any]) -> DictConfig:
 def from_its_folder(config: DictConfig, tags: Mapping[str, str]) -> DictConfig:
     """Return a run's configuration with the paths of its data made absolute, from the folder where it was started."""
     for key in PATHS:
-        if isinstance(path := config.data.get(key), str) and "working_folder" in tags:
-            config.data[key] = str(Path(tags["working_folder"], path))
+        if isinstance(path := config.data.get(key), str) and WORKING_FOLDER_TAG in tags:
+            config.data[key] = str(Path(tags[WORKING_FOLDER_TAG], path))
     return config
 
 

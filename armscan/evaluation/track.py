@@ -29,7 +29,7 @@ REPORT_KEYS = {"of", "name", "splits", "volumes", "episodes", "tracked_as"}
 
 def evaluate_and_track(
     prepared: PreparedAgent,
-    store: Mapping[str, Any],
+    tracking: Mapping[str, Any],
     *,
     n_episodes: int,
     seed: int,
@@ -40,7 +40,7 @@ def evaluate_and_track(
 
     Args:
         prepared: Agent on its volumes.
-        store: Config section `tracking`; used for an agent without a run.
+        tracking: Section `tracking` of the configuration, used for an agent without a run.
         n_episodes: Number of episodes for each group of volumes.
         seed: Seed of the evaluation, which the seeds of its episodes follow from.
         changes: Rules of the episodes that differ from the agent's configuration.
@@ -54,8 +54,8 @@ def evaluate_and_track(
     """
     source = prepared.source
     _check_out(out)
-    client, experiment_id = _store_of(source, store)
-    upload_pending(client)
+    store, experiment_id = _store_of(source, tracking)
+    upload_pending(store)
     limits = on_plane_of(source.config)
     of, data = source.run.run_id if source.run else source.name, data_name(prepared.data)
     facts = {
@@ -68,7 +68,7 @@ def evaluate_and_track(
         "notes": list(prepared.notes),
     }
     with TrackedRun.start(
-        client,
+        store,
         experiment_id,
         name=", ".join([f"evaluation: {source.name} on {data}", *assigned(changes)]),
         config={**to_plain(source.config), "evaluation": {**facts, "on_plane": [list(each) for each in limits]}},
@@ -116,12 +116,12 @@ def changed_rules(changes: Mapping[str, Any]) -> list[str]:
     return [f"changed for this evaluation: {', '.join(assigned(changes))}"] if changes else []
 
 
-def _store_of(source: EvaluatedAgent, store: Mapping[str, Any]) -> tuple[TrackingStore, str]:
+def _store_of(source: EvaluatedAgent, tracking: Mapping[str, Any]) -> tuple[TrackingStore, str]:
     """Return the tracking store of an evaluation, and the ID of its MLflow experiment: those of the agent's run."""
     if source.run is None:
-        return open_store(**store)
-    check_artifacts(source.run.client, source.run.experiment_id)
-    return source.run.client, source.run.experiment_id
+        return open_store(**tracking)
+    check_artifacts(source.run.store, source.run.experiment_id)
+    return source.run.store, source.run.experiment_id
 
 
 def _check_out(out: Path | None) -> None:

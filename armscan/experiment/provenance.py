@@ -29,6 +29,7 @@ from armscan.tracking import (
 )
 from armscan.tracking.tags import (
     CHOICE,
+    COMMAND_TAG,
     DOMAIN_TAG,
     FOLDER_TAG,
     HOST_TAG,
@@ -38,6 +39,7 @@ from armscan.tracking.tags import (
     SUBJECTS,
     VERSION_TAG,
     VOLUMES,
+    WORKING_FOLDER_TAG,
 )
 from armscan.training import TrainingDomain
 from armscan.utils.files import atomic_write, sha256
@@ -77,8 +79,8 @@ def start_tracking(
         retry_s: Seconds to wait for an unavailable store. Default: None, no waiting.
     """
     resolved = to_plain(config)
-    client, experiment_id = open_store(**resolved["tracking"], retry_s=retry_s)
-    upload_pending(client)
+    store, experiment_id = open_store(**resolved["tracking"], retry_s=retry_s)
+    upload_pending(store)
     choices, job = _with_own_observation(invocation.choices, resolved), invocation.job
     files = provenance_files(resolved, setup)
     _remove_earlier(invocation.folder)
@@ -86,13 +88,13 @@ def start_tracking(
     for name, contents in files.items():
         atomic_write(invocation.folder / name, contents)
     started = TrackedRun.start(
-        client,
+        store,
         experiment_id,
         name=run_name(resolved, choices),
         config=resolved,
         tags={
             **environment_tags(),
-            "command": invocation.command,
+            COMMAND_TAG: invocation.command,
             "seed": str(resolved["seed"]),
             OVERRIDES_TAG: " ".join(invocation.overrides),
             **{f"{CHOICE}{group}": choices[group] for group in CHOICES},
@@ -100,7 +102,7 @@ def start_tracking(
             # On other volumes, an evaluation must reproduce the agent's observations.
             DOMAIN_TAG: TrainingDomain.of(setup.training_env, setup.smallest_slice_px).to_json(),
             **place_tags(invocation.folder),
-            "working_folder": str(Path.cwd()),
+            WORKING_FOLDER_TAG: str(Path.cwd()),
             **sha256_tags(files),
             **({OWN_CODE_TAG: as_tag(setup.own_code)} if setup.own_code else {}),
             **({JOB_TAG: str(job.number)} if job else {}),

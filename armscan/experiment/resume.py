@@ -27,7 +27,7 @@ from armscan.experiment.provenance import place_tags, volume_tags
 from armscan.experiment.runner import run_tracked
 from armscan.tracking import TrackedRun, TrackingStore, check_run_id, check_version, find_run, open_existing_store, sync
 from armscan.tracking.notes import Note
-from armscan.tracking.tags import FOLDER_TAG, GRID_TAG, OWN_CODE_TAG, STUDY_TAG
+from armscan.tracking.tags import FOLDER_TAG, GRID_TAG, HOST_TAG, OWN_CODE_TAG, STUDY_TAG, WORKING_FOLDER_TAG
 from armscan.training import Fingerprints, check_unchanged, fingerprints_in, resume_from_checkpoint
 from armscan.utils.files import SQLITE_PREFIX, remove_unfinished, sha256, sqlite_file
 from armscan.utils.run_files import (
@@ -60,10 +60,10 @@ def resume(arguments: Sequence[str], repeat_grid: Callable[..., None]) -> None:
     trust = TRUST in arguments
     wanted, uri = _read([each for each in arguments if each != TRUST])
     check_run_id(wanted)
-    client = open_existing_store(uri)
-    run = find_run(client, wanted)
+    store = open_existing_store(uri)
+    run = find_run(store, wanted)
     if GRID_TAG not in run.data.tags:
-        resume_run(client, run.info.run_id, trust=trust)
+        resume_run(store, run.info.run_id, trust=trust)
         return
     _check_unfinished(run)
     _check_ended(run)
@@ -71,7 +71,7 @@ def resume(arguments: Sequence[str], repeat_grid: Callable[..., None]) -> None:
     if not trust:
         _check_grid(run, grid, uri)
     _enter_working_folder(run, trust=trust)
-    _check_store(run, grid, client.uri)
+    _check_store(run, grid, store.uri)
     repeat_grid(grid, run.info.run_id, trust=trust)
 
 
@@ -115,7 +115,7 @@ def _check_grid(run: Run, overrides: Sequence[str], uri: str) -> None:
     where = f"run {run.info.run_id}"
     check_stored_overrides(overrides, uri, where=where)
     # Its `conf/` and `sweeps/` are part of the configuration.
-    folder = Path(_tag(run, "working_folder"))
+    folder = Path(_tag(run, WORKING_FOLDER_TAG))
     if folder.resolve() != Path.cwd().resolve():
         raise UntrustedError(
             f"{where}: it was started in {folder}, whose configuration could execute code of others; repeat the "
@@ -124,16 +124,16 @@ def _check_grid(run: Run, overrides: Sequence[str], uri: str) -> None:
 
 
 def resume_run(
-    client: TrackingStore, run_id: str, *, job_label: str | None = None, trust: bool = False
+    store: TrackingStore, run_id: str, *, job_label: str | None = None, trust: bool = False
 ) -> dict[str, dict[str, float]]:
     """Resume a run; see `resume`. The printed lines of a grid's job begin with its label."""
-    run = client.get_run(run_id)
-    client.check_artifacts_of(run)
+    run = store.get_run(run_id)
+    store.check_artifacts_of(run)
     folder = _folder_of(run)
     with folder_lock(folder):
         # Send what it could not send before; it may also have finished just before the lock was free.
-        sync(folder, lambda _: client)
-        run = client.get_run(run_id)
+        sync(folder, lambda _: store)
+        run = store.get_run(run_id)
         _check_unfinished(run)
         config = _config_of(run, folder)
         migrated = stored_config(config, where=f"run {run_id}", trust=trust)
@@ -147,8 +147,8 @@ def resume_run(
         agent = setup.agent
         earlier = resume_from_checkpoint(agent, folder, setup.provenance(run_id)) if isinstance(agent, Learner) else []
         tags = volume_tags(setup) | place_tags(folder)
-        tracked = TrackedRun.reopen(client, run, folder=folder, config=config, tags=tags)
-        return run_tracked(setup, tracked, folder, client.uri, job_label=job_label, earlier=earlier)
+        tracked = TrackedRun.reopen(store, run, folder=folder, config=config, tags=tags)
+        return run_tracked(setup, tracked, folder, store.uri, job_label=job_label, earlier=earlier)
 
 
 def _read(overrides: Sequence[str]) -> tuple[str, str]:
@@ -183,7 +183,7 @@ def _folder_of(run: Run) -> Path:
     if not folder.is_dir():
         raise ResumeError(
             f"run {run_id} cannot be resumed: its folder {folder} is not there; it last ran on the host "
-            f"{_tag(run, 'host')}"
+            f"{_tag(run, HOST_TAG)}"
         )
     outboxes = {file.stem for file in (folder / OUTBOX_FOLDER).glob(f"*{OUTBOX_SUFFIXES[-1]}")}
     if outboxes and run_id not in outboxes:
@@ -255,7 +255,7 @@ def check_own_code(run: Run, setup: RunSetup) -> None:
 
 def _enter_working_folder(run: Run, *, trust: bool) -> None:
     """Change to the working folder of the run, where its relative paths begin and, if trusted, its own classes are."""
-    folder, left = _tag(run, "working_folder"), str(Path.cwd())
+    folder, left = _tag(run, WORKING_FOLDER_TAG), str(Path.cwd())
     try:
         os.chdir(folder)
     # ValueError: the path has characters that no path can have.

@@ -34,7 +34,15 @@ from armscan.launch.grid_jobs import shared_overrides
 from armscan.launch.launchers import LAUNCHER, ON_THIS_MACHINE, check_launcher, prepare_launcher
 from armscan.tracking import TrackingSettings, TrackingStore, begin_outbox, code_state, note_end, open_store, sync
 from armscan.tracking.sync import PROCESS_DIED
-from armscan.tracking.tags import CONTINUED_TAG, FAILURE_TAG, FOLDER_TAG, GRID_TAG, JOB_TAG
+from armscan.tracking.tags import (
+    CONTINUED_TAG,
+    FAILURE_TAG,
+    FOLDER_TAG,
+    GRID_TAG,
+    JOB_TAG,
+    OVERRIDES_TAG,
+    WORKING_FOLDER_TAG,
+)
 from armscan.utils.processes import ProcessInfo
 from armscan.utils.run_files import LAST_CHECKPOINT, RESULTS_PAGE
 
@@ -89,7 +97,7 @@ class Multirun(Callback):
         tracking = to_plain(config.tracking)
         TrackingSettings.read("tracking", tracking)
         overrides = list(config.hydra.overrides.task)
-        client, experiment_id = open_store(**tracking)
+        store, experiment_id = open_store(**tracking)
         (folder / OUTCOME_FOLDER).mkdir(parents=True)
         command = " ".join(overrides)
         # Includes the tracking URI, because the environment may differ later.
@@ -101,13 +109,13 @@ class Multirun(Callback):
         ]
         tags = {
             **code_state().tags,
-            "overrides": command,
-            "working_folder": str(Path.cwd()),
+            OVERRIDES_TAG: command,
+            WORKING_FOLDER_TAG: str(Path.cwd()),
             GRID_TAG: json.dumps(again),
         }
-        run = client.create_run(experiment_id, name=f"grid {command}"[:250], tags=tags)
+        run = store.create_run(experiment_id, name=f"grid {command}"[:250], tags=tags)
         if Multirun.repeats is not None:
-            client.set_tag(Multirun.repeats, CONTINUED_TAG, run.info.run_id)
+            store.set_tag(Multirun.repeats, CONTINUED_TAG, run.info.run_id)
         parent = {"run_id": run.info.run_id, "tracking": tracking, "overrides": overrides}
         parent |= {"common": shared_overrides(OverridesParser.create().parse_overrides([*overrides]))}
         parent |= {"repeats": Multirun.repeats, "is_trusted": Multirun.is_trusted}

@@ -44,10 +44,10 @@ def run_again(config: DictConfig, invocation: Invocation, job: Job) -> Metrics:
     if not job.is_trusted:
         check_composed(resolved, where=f"job {job.number}")
     setup = set_up(config)
-    client, experiment_id = open_store(**resolved["tracking"])
-    earlier = earlier_runs(client, experiment_id, sha256_tags(provenance_files(resolved, setup)), job)
+    store, experiment_id = open_store(**resolved["tracking"])
+    earlier = earlier_runs(store, experiment_id, sha256_tags(provenance_files(resolved, setup)), job)
     if not any(run.data.tags.get(PARENT_TAG) == job.repeats for run in earlier):
-        _check_volumes(client, experiment_id, params_of(resolved), setup.fingerprints, job)
+        _check_volumes(store, experiment_id, params_of(resolved), setup.fingerprints, job)
     for run in earlier:
         if run.data.tags.get(PARENT_TAG) == job.repeats:
             check_own_code(run, setup)
@@ -56,7 +56,7 @@ def run_again(config: DictConfig, invocation: Invocation, job: Job) -> Metrics:
     for run in earlier:
         if run.info.status == "FINISHED":
             print(f"[{job.label}] has finished before: run {run.info.run_id}", flush=True)
-            _set_parent(client, run, job)
+            _set_parent(store, run, job)
             return _metrics_of(run)
     for run in earlier:
         folder = run.data.tags.get(FOLDER_TAG)
@@ -65,32 +65,32 @@ def run_again(config: DictConfig, invocation: Invocation, job: Job) -> Metrics:
             # Raises if the run is in progress, as after its launcher was killed: it would be trained twice.
             with folder_lock(Path(folder)):
                 # Ends the run if its process has died.
-                sync(Path(folder), lambda _: client)
-            run = client.get_run(run.info.run_id)
+                sync(Path(folder), lambda _: store)
+            run = store.get_run(run.info.run_id)
         if run.info.status != "RUNNING" and folder is not None and (Path(folder) / LAST_CHECKPOINT).exists():
-            _set_parent(client, run, job)
+            _set_parent(store, run, job)
             # Trusted, because its configuration is this job's.
-            return resume_run(client, run.info.run_id, job_label=job.label, trust=True)
+            return resume_run(store, run.info.run_id, job_label=job.label, trust=True)
     return run_experiment(config, invocation)
 
 
-def earlier_runs(client: TrackingStore, experiment_id: str, sums: Mapping[str, str], job: Job) -> list[Run]:
+def earlier_runs(store: TrackingStore, experiment_id: str, sums: Mapping[str, str], job: Job) -> list[Run]:
     """Return the earlier runs of a job: first those of the repeated grid, and each time the latest first.
 
     Then come single runs, and jobs of grids with the same command line, such as an earlier repetition. Trials of
     studies and jobs of other grids are left out.
 
     Args:
-        client: Store of the runs.
+        store: Store of the runs.
         experiment_id: ID of their MLflow experiment.
         sums: Checksums of the job's configuration and volumes, as tags.
         job: Job to repeat.
     """
     wanted = " and ".join(f"tags.`{tag}` = '{value}'" for tag, value in sums.items())
-    found = client.search_runs([experiment_id], wanted, order_by=["attributes.start_time DESC"])
+    found = store.search_runs([experiment_id], wanted, order_by=["attributes.start_time DESC"])
     parents = {run.info.run_id: run.data.tags.get(PARENT_TAG) for run in found if STUDY_TAG not in run.data.tags}
     known = [each for each in {*parents.values(), job.parent_run_id} if each is not None and each.isalnum()]
-    grids = client.runs([experiment_id], f"attributes.run_id IN ({', '.join(map(repr, known))})")
+    grids = store.runs([experiment_id], f"attributes.run_id IN ({', '.join(map(repr, known))})")
     overrides = {grid.info.run_id: _overrides_of(grid) for grid in grids}
     kin = {grid for grid in overrides if overrides[grid] == overrides.get(job.parent_run_id)} | {job.repeats, None}
     own = [run for run in found if run.info.run_id in parents and parents[run.info.run_id] in kin]
@@ -98,19 +98,19 @@ def earlier_runs(client: TrackingStore, experiment_id: str, sums: Mapping[str, s
 
 
 def _check_volumes(
-    client: TrackingStore, experiment_id: str, params: Mapping[str, str], now: Fingerprints, job: Job
+    store: TrackingStore, experiment_id: str, params: Mapping[str, str], now: Fingerprints, job: Job
 ) -> None:
     """Raise `ChangedVolumesError` if the repeated grid has a run on the same data whose volumes, in all, were others.
 
     The folds of a cross-validation have the same volumes, in other parts; another subject would be another fold.
     """
     assert job.repeats is not None
-    for run in client.children(experiment_id, job.repeats):
+    for run in store.children(experiment_id, job.repeats):
         if _data_in(run.data.params) != _data_in(params):
             continue
         # A run that was killed at its start has no record of its volumes.
         with contextlib.suppress(TrackingError), TemporaryDirectory() as folder:
-            if (then := load_run(client.uri, run.info.run_id).volumes(Path(folder))) is not None:
+            if (then := load_run(store.uri, run.info.run_id).volumes(Path(folder))) is not None:
                 check_unchanged({"grid's": _joined(then)}, {"grid's": _joined(now)}, f"run {run.info.run_id} of it had")
                 return
 
@@ -130,10 +130,10 @@ def _overrides_of(grid: Run) -> set[str]:
     return set()
 
 
-def _set_parent(client: TrackingStore, run: Run, job: Job) -> None:
+def _set_parent(store: TrackingStore, run: Run, job: Job) -> None:
     """Make a run a child of the grid that is repeated."""
-    client.set_tag(run.info.run_id, PARENT_TAG, job.parent_run_id)
-    client.set_tag(run.info.run_id, JOB_TAG, str(job.number))
+    store.set_tag(run.info.run_id, PARENT_TAG, job.parent_run_id)
+    store.set_tag(run.info.run_id, JOB_TAG, str(job.number))
 
 
 def _metrics_of(run: Run) -> Metrics:

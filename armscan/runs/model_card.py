@@ -93,13 +93,13 @@ def _reports(run: FoundRun, folder: Path) -> dict[str, EvaluationReport]:
 
 def _evaluated(run: FoundRun) -> Iterator[tuple[str, str]]:
     """Yield the evaluations of a run that kept their JSON, the latest first: MLflow run ID, and file."""
-    found = run.client.search_runs(
+    found = run.store.search_runs(
         [run.experiment_id],
         f"tags.`{EVALUATED_TAG}` = '{run.run_id}' and attributes.status = 'FINISHED'",
         order_by=["attributes.start_time DESC"],
     )
     for evaluation in found:
-        for artifact in run.client.list_artifacts(evaluation.info.run_id):
+        for artifact in run.store.list_artifacts(evaluation.info.run_id):
             if artifact.path.endswith(".json") and not artifact.is_dir:
                 yield evaluation.info.run_id, artifact.path
                 break
@@ -139,7 +139,7 @@ def _own_baselines(run: FoundRun, folder: Path) -> dict[str, dict[str, Evaluatio
 
 
 def _json(run: FoundRun, run_id: str, file: str, folder: Path) -> Any:
-    text = Path(run.client.download_artifacts(run_id, file, str(folder))).read_bytes()
+    text = Path(run.store.download_artifacts(run_id, file, str(folder))).read_bytes()
     if run_id == run.run_id and not is_as_tagged(file, text, run.tags):
         raise _damaged(run_id, file)
     try:

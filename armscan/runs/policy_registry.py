@@ -91,16 +91,16 @@ def register_policy(tracking: str, run_id: str, name: str, *, trust: bool) -> st
     with tempfile.TemporaryDirectory() as beside, store_errors(run.uri):
         folder = Path(beside, POLICY_FOLDER)
         if is_kept := _is_kept(run):
-            _check_kept(run, Path(run.client.download_artifacts(run.run_id, POLICY_FOLDER, beside)))
+            _check_kept(run, Path(run.store.download_artifacts(run.run_id, POLICY_FOLDER, beside)))
         else:
-            check_artifacts(run.client, run.experiment_id)
+            check_artifacts(run.store, run.experiment_id)
             export_policy(tracking, run_id, folder, trust=trust)
         differs = (Model.load(str(folder)).metadata or {}).get("differs_from_agent")
         card = Card.of(run, Path(beside), differs)
         if not is_kept:
-            run.client.log_artifacts(run.run_id, str(folder), POLICY_FOLDER)
+            run.store.log_artifacts(run.run_id, str(folder), POLICY_FOLDER)
             for tag, value in tags_of_kept(folder).items():
-                run.client.set_tag(run.run_id, tag, value)
+                run.store.set_tag(run.run_id, tag, value)
         return _registered(run, name, card)
 
 
@@ -114,7 +114,7 @@ def _check_name(name: str) -> None:
 
 
 def _is_kept(run: FoundRun) -> bool:
-    files = run.client.list_artifacts(run.run_id, POLICY_FOLDER) if POLICY_FOLDER in run.files else []
+    files = run.store.list_artifacts(run.run_id, POLICY_FOLDER) if POLICY_FOLDER in run.files else []
     return SUM_TAG in run.tags and f"{POLICY_FOLDER}/{MODEL_FILE}" in [file.path for file in files]
 
 
@@ -147,17 +147,17 @@ def _not_kept(run: FoundRun) -> ExportError:
 
 
 def _registered(run: FoundRun, name: str, card: Card) -> str:
-    source = f"{run.client.get_run(run.run_id).info.artifact_uri}/{POLICY_FOLDER}"
+    source = f"{run.store.get_run(run.run_id).info.artifact_uri}/{POLICY_FOLDER}"
     try:
-        run.client.create_registered_model(name)
+        run.store.create_registered_model(name)
     except MlflowException as error:
         if error.error_code != "RESOURCE_ALREADY_EXISTS":
             raise
-    model = model_of(run.client.mlflow, run.client.get_run(run.run_id))
+    model = model_of(run.store.mlflow, run.store.get_run(run.run_id))
     tags = card.tags | ({MODEL_TAG: model.model_id} if model else {})
-    version = run.client.create_model_version(name, source, run.run_id, tags=tags, description=card.text)
-    run.client.set_registered_model_alias(name, CHAMPION, version.version)
+    version = run.store.create_model_version(name, source, run.run_id, tags=tags, description=card.text)
+    run.store.set_registered_model_alias(name, CHAMPION, version.version)
     if model:
         registered = [*json.loads(model.tags.get(VERSIONS_TAG, "[]")), {"name": name, "version": str(version.version)}]
-        run.client.set_logged_model_tags(model.model_id, {VERSIONS_TAG: json.dumps(registered)})
+        run.store.set_logged_model_tags(model.model_id, {VERSIONS_TAG: json.dumps(registered)})
     return f"models:/{name}/{version.version}"

@@ -39,18 +39,18 @@ class PruneItem:
     left: str | None = None
 
 
-def plan(client: TrackingStore, runs: Sequence[Run], what: str) -> list[PruneItem]:
+def plan(store: TrackingStore, runs: Sequence[Run], what: str) -> list[PruneItem]:
     """Plan the removal of files of runs; remove nothing.
 
     Args:
-        client: Tracking store of the runs.
+        store: Tracking store of the runs.
         runs: Runs whose files are to be removed.
         what: `CHECKPOINTS`, or `FOLDERS` for all files of a run.
 
     Returns:
         The plan of each run: the bytes that it would free, or the reason why its files stay.
     """
-    everything = {run.info.run_id: run for run in client.runs(experiment_ids(client))}
+    everything = {run.info.run_id: run for run in store.runs(experiment_ids(store))}
     noted = defaultdict(set)
     for run_id, run in everything.items():
         noted[run.data.tags.get(FOLDER_TAG)].add(run_id)
@@ -68,11 +68,11 @@ def plan(client: TrackingStore, runs: Sequence[Run], what: str) -> list[PruneIte
     return items
 
 
-def remove(client: TrackingStore, item: PruneItem, what: str) -> str | None:
+def remove(store: TrackingStore, item: PruneItem, what: str) -> str | None:
     """Remove the files of a run that a plan names.
 
     Args:
-        client: Tracking store of the run.
+        store: Tracking store of the run.
         item: Plan of the run; one that says why its files stay is not allowed.
         what: `CHECKPOINTS` or `FOLDERS`, as in the plan.
 
@@ -87,7 +87,7 @@ def remove(client: TrackingStore, item: PruneItem, what: str) -> str | None:
     folder = OwnFolder.of(item.run)
     with folder.held():
         # Another process may have begun to use it, or have removed it, since it was planned.
-        now = _with_ancestors(client, run_id)
+        now = _with_ancestors(store, run_id)
         if run_id not in now:
             raise RunSkippedError("it has been deleted meanwhile")
         for file in _files(_folder(now[run_id], now), what):
@@ -98,7 +98,7 @@ def remove(client: TrackingStore, item: PruneItem, what: str) -> str | None:
         return None if folder.remove_emptied() else f"{folder.path} stays, with what is not the run's"
 
 
-def remove_planned(client: TrackingStore, items: Sequence[PruneItem], what: str) -> int:
+def remove_planned(store: TrackingStore, items: Sequence[PruneItem], what: str) -> int:
     """Remove the planned files, run by run, and print each outcome; return the exit code."""
     freed, n_removed, n_failed = 0, 0, 0
     for item in items:
@@ -107,7 +107,7 @@ def remove_planned(client: TrackingStore, items: Sequence[PruneItem], what: str)
             print(f"{run_id} stays: {item.left}")
             continue
         try:
-            note = remove(client, item, what)
+            note = remove(store, item, what)
         except RunSkippedError as error:
             print(f"{run_id} stays: {error}")
         # A failure for one run must not stop the others.
@@ -141,11 +141,11 @@ def _folder(run: Run, runs: Mapping[str, Run], sharing: Collection[str] = ()) ->
     return folder
 
 
-def _with_ancestors(client: TrackingStore, run_id: str) -> dict[str, Run]:
+def _with_ancestors(store: TrackingStore, run_id: str) -> dict[str, Run]:
     """Return a run and those above it, as the store has them now, by their IDs; empty if it has been deleted."""
-    everywhere, runs = experiment_ids(client), dict[str, Run]()
+    everywhere, runs = experiment_ids(store), dict[str, Run]()
     while run_id.isalnum() and run_id not in runs:
-        if not (found := client.runs(everywhere, f"attributes.run_id = '{run_id}'")):
+        if not (found := store.runs(everywhere, f"attributes.run_id = '{run_id}'")):
             break
         (runs[run_id],) = found
         run_id = runs[run_id].data.tags.get(PARENT_TAG, "")

@@ -17,7 +17,7 @@ from armscan.tracking.tracking_store import all_pages, reason_in
 
 
 def find_runs(
-    client: TrackingStore,
+    store: TrackingStore,
     *,
     experiment: str | None = None,
     parent: str | None = None,
@@ -32,7 +32,7 @@ def find_runs(
     """Return the runs of a store that match all criteria, in no particular order. Default: all runs.
 
     Args:
-        client: Client of the store.
+        store: Tracking store.
         experiment: Name of the MLflow experiment.
         parent: MLflow run ID of the parent run, or its first characters.
         status: Allowed statuses, in lower case.
@@ -47,16 +47,16 @@ def find_runs(
         InvalidValueError: If there is no such experiment, or MLflow rejects the filter.
         TrackingError: If there is no such parent.
     """
-    experiments = experiment_ids(client, experiment)
+    experiments = experiment_ids(store, experiment)
     conditions = [
         f"attributes.start_time {sign} {round(moment.timestamp() * 1000)}"
         for sign, moment in ((">=", since), ("<", before))
         if moment is not None
     ]
     conditions += [where] if where else []
-    below = None if parent is None else _below(client.runs(experiments), find_run(client, parent).info.run_id)
+    below = None if parent is None else _below(store.runs(experiments), find_run(store, parent).info.run_id)
     try:
-        runs = client.runs(experiments, " and ".join(conditions))
+        runs = store.runs(experiments, " and ".join(conditions))
     except MlflowException as error:
         if where is None or error.error_code != "INVALID_PARAMETER_VALUE":
             raise
@@ -96,19 +96,19 @@ def _projection_params(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(","))
 
 
-def experiment_ids(client: TrackingStore, name: str | None = None) -> list[str]:
+def experiment_ids(store: TrackingStore, name: str | None = None) -> list[str]:
     """Return the IDs of experiments.
 
     Args:
-        client: Tracking store of the experiments.
+        store: Tracking store of the experiments.
         name: Name of the only experiment. Default: None, all of the store.
 
     Raises:
         InvalidValueError: If there is no experiment with this name.
     """
-    experiments = all_pages(client.search_experiments)
+    experiments = all_pages(store.search_experiments)
     found = [each.experiment_id for each in experiments if name in (None, each.name)]
     if not found and name is not None:
         there = f"only {listed(each.name for each in experiments)}" if experiments else "none"
-        raise InvalidValueError(f"--experiment is {name!r}, but {client.uri} has {there}")
+        raise InvalidValueError(f"--experiment is {name!r}, but {store.uri} has {there}")
     return found

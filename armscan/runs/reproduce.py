@@ -25,7 +25,7 @@ from armscan.tracking import FoundRun, code_state, environment_tags, load_agent_
 from armscan.tracking.environment import CONSTRAINTS_SUM, REPORTED_PACKAGES, environment
 from armscan.tracking.git import COMMIT, DIFF_SUM, DIRTY
 from armscan.tracking.sync import ENDED
-from armscan.tracking.tags import CHOICE, OVERRIDES_TAG, OWN_CODE_TAG
+from armscan.tracking.tags import CHOICE, OVERRIDES_TAG, OWN_CODE_TAG, RESUMED_TAG, UNKNOWN
 from armscan.training import check_unchanged
 from armscan.utils.run_files import DIFF_FILE, ENVIRONMENT_FILE, REPRODUCTION_FILE, folder_lock
 
@@ -72,7 +72,7 @@ def load_original(tracking: str, run_id: str, *, trust: bool = False) -> Origina
         volumes = run.volumes(Path(folder))
         text = run.text(ENVIRONMENT_FILE, Path(folder))
     config.tracking.uri = tracking
-    config.tracking.experiment = run.client.get_experiment(run.experiment_id).name
+    config.tracking.experiment = run.store.get_experiment(run.experiment_id).name
     setup = set_up(config)
     if volumes is not None:
         check_unchanged(volumes, setup.fingerprints, f"run {run.run_id} was started with")
@@ -103,7 +103,7 @@ def differences(original: Original) -> list[str]:
         lines.append(f"changes since the commit {_changes(tags)}, and {_changes(now)} now{kept}")
     if modules := changed_modules(tags.get(OWN_CODE_TAG), original.setup.own_code):
         lines.append(f"the code of {few(modules)} has changed since")
-    if "resumed" in tags:
+    if RESUMED_TAG in tags:
         lines.append(f"the run was cut off and resumed (times: {tags['resumed']}), which changes no figure by itself")
     if original.environment is None:
         return [*lines, "the versions of its packages were not kept"]
@@ -111,7 +111,7 @@ def differences(original: Original) -> list[str]:
     machine = [key for key in ("python", "platform", "machine") if before.get(key) != here[key]]
     lines += [f"{key} was {before.get(key)}, and is {here[key]}" for key in machine]
     # armscan's own version adds nothing to a commit.
-    own = set() if "unknown" in (tags.get(COMMIT), now.get(COMMIT)) else {"armscan"}
+    own = set() if UNKNOWN in (tags.get(COMMIT), now.get(COMMIT)) else {"armscan"}
     packages = sorted((before["packages"].keys() | here["packages"].keys()) - own)
     pairs = {name: [each["packages"].get(name, "not installed") for each in (before, here)] for name in packages}
     changed = {name: f"{name} was {then}, and is {now}" for name, (then, now) in pairs.items() if then != now}
@@ -125,7 +125,7 @@ def differences(original: Original) -> list[str]:
 def not_compared(original: Original) -> list[str]:
     """Return the parts of a run's code that cannot be compared with today's, in a line each."""
     lines = []
-    if "unknown" in (original.run.tags.get(COMMIT), code_state().tags.get(COMMIT)):
+    if UNKNOWN in (original.run.tags.get(COMMIT), code_state().tags.get(COMMIT)):
         lines.append("the code of armscan, which did not run from a git repository then or does not now")
     if original.run.needs_trust and OWN_CODE_TAG not in original.run.tags:
         lines.append("the code of classes that are not armscan's, of which the run has no checksums")
@@ -157,7 +157,7 @@ def reproduce(original: Original, folder: Path, differing: Sequence[str]) -> Com
         raise InvalidValueError(f"--out is {str(folder)!r}, but it exists and is not an empty folder: name another")
     is_ours = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
-    choices = {group: run.tags.get(f"{CHOICE}{group}", "unknown") for group in CHOICES}
+    choices = {group: run.tags.get(f"{CHOICE}{group}", UNKNOWN) for group in CHOICES}
     overrides = run.tags.get(OVERRIDES_TAG, "").split()
     uri = original.config.tracking.uri
     command = armscan_command("runs", "reproduce", run.run_id, tracking=uri, trust=original.setup.needs_trust)
@@ -170,9 +170,9 @@ def reproduce(original: Original, folder: Path, differing: Sequence[str]) -> Com
         if is_ours:
             remove_if_untracked(folder, error)
         raise
-    comparison = compare_runs(run.client, run.run_id, tracked.run_id)
+    comparison = compare_runs(run.store, run.run_id, tracked.run_id)
     facts = {"of": run.run_id, "run": tracked.run_id, "differences": list(differing), **comparison.to_dict()}
     (folder / REPRODUCTION_FILE).write_text(json.dumps(facts, indent=1))
-    run.client.set_tag(tracked.run_id, SAME_TAG, str(comparison.is_same).lower())
-    run.client.log_artifact(tracked.run_id, str(folder / REPRODUCTION_FILE))
+    run.store.set_tag(tracked.run_id, SAME_TAG, str(comparison.is_same).lower())
+    run.store.log_artifact(tracked.run_id, str(folder / REPRODUCTION_FILE))
     return comparison

@@ -32,7 +32,7 @@ SORTS = {
 }
 
 
-def artifacts_of(client: TrackingStore, run: Run) -> dict[str, int] | None:
+def artifacts_of(store: TrackingStore, run: Run) -> dict[str, int] | None:
     """Return the bytes of each artifact of a run by its path; None if their store cannot be read."""
 
     def listed(path: str | None) -> Iterator[tuple[str, int]]:
@@ -43,7 +43,7 @@ def artifacts_of(client: TrackingStore, run: Run) -> dict[str, int] | None:
                 yield each.path, each.file_size or 0
 
     try:
-        repository = client.artifacts(run)
+        repository = store.artifacts(run)
         return dict(listed(None))
     # The run is listed all the same, with an unknown size.
     except (MlflowException, RequestException, OSError, UntrustedError):
@@ -55,14 +55,14 @@ class RunRow:
     """A run of a list.
 
     Args:
-        client: Client of the run's store, which gives sizes when they are needed.
+        store: Store of the run, which gives sizes when they are needed.
         run: Run of the row.
         children: Rows of the selected runs that it started, the earliest first. Default: none.
         depth: Level below the topmost run, 0 or more; 1 for a child shown below its parent. Default: 0.
         is_collapsed: Whether its sizes include those of the runs below it. Default: True.
     """
 
-    client: TrackingStore = field(repr=False)
+    store: TrackingStore = field(repr=False)
     run: Run
     children: tuple[RunRow, ...] = ()
     depth: int = 0
@@ -84,7 +84,7 @@ class RunRow:
     @cached_property
     def artifact_bytes(self) -> int | None:
         """Bytes of its artifacts, and of those collapsed into it; None if a store cannot be read."""
-        artifacts = artifacts_of(self.client, self.run)
+        artifacts = artifacts_of(self.store, self.run)
         parts = [None if artifacts is None else sum(artifacts.values())]
         parts += [child.artifact_bytes for child in self.children if self.is_collapsed]
         known = [part for part in parts if part is not None]
@@ -134,7 +134,7 @@ class RunRow:
             yield from child.expanded(depth + 1)
 
 
-def collapse(client: TrackingStore, runs: Sequence[Run]) -> list[RunRow]:
+def collapse(store: TrackingStore, runs: Sequence[Run]) -> list[RunRow]:
     """Return a row for each run whose parent is not among the runs; the others are collapsed into these rows.
 
     Runs that are nested too deeply, or are their own ancestors, also have rows of their own.
@@ -153,7 +153,7 @@ def collapse(client: TrackingStore, runs: Sequence[Run]) -> list[RunRow]:
         children[parents[run_id] if is_below else ""].append(run)
 
     def rows(parent: str) -> tuple[RunRow, ...]:
-        return tuple(RunRow(client, run, rows(run.info.run_id)) for run in children[parent])
+        return tuple(RunRow(store, run, rows(run.info.run_id)) for run in children[parent])
 
     return list(rows(""))
 

@@ -21,6 +21,7 @@ from armscan.tracking import TrackingStore
 from armscan.tracking.tags import (
     AGENT_TAG,
     BEST_TAG,
+    COMMAND_TAG,
     DESCRIPTION_TAG,
     EVALUATED_TAG,
     FAILURE_TAG,
@@ -36,26 +37,26 @@ from armscan.utils.run_files import BEST_CHECKPOINT, ID_CHARS, LAST_CHECKPOINT
 from armscan.utils.text import format_duration
 
 # Tags that say how a run was started; the first one that it has is shown.
-STARTED_BY = ("command", OVERRIDES_TAG)
+STARTED_BY = (COMMAND_TAG, OVERRIDES_TAG)
 MAX_VALUE_CHARS = 200
 
 
-def show(client: TrackingStore, run: Run, uri: str) -> None:
+def show(store: TrackingStore, run: Run, uri: str) -> None:
     """Print a run's start and end, its figures, files and children, and the commands that use it."""
-    console, entry = wide_console(), RunRow(client, run)
+    console, entry = wide_console(), RunRow(store, run)
     tags = {name: value for name, value in run.data.tags.items() if value}
     _print_pairs(console, "", _facts(run, entry))
     _print_figures(console, run)
     shown = {*STARTED_BY, FAILURE_TAG, PARENT_TAG}
     others = {name: tags[name] for name in sorted(tags) if name not in shown and not name.startswith("mlflow.")}
     _print_pairs(console, "tags", others)
-    artifacts = artifacts_of(client, run)
+    artifacts = artifacts_of(store, run)
     folder = _print_folder(console, run)
     if artifacts is None:
         _print_pairs(console, f"artifacts in {run.info.artifact_uri}: they cannot be read", {})
     else:
         _print_sizes(console, f"artifacts in {run.info.artifact_uri}", artifacts)
-    children = client.children(run.info.experiment_id, run.info.run_id)
+    children = store.children(run.info.experiment_id, run.info.run_id)
     if children:
         console.print("\nchildren", style="bold")
         table = narrow_table(

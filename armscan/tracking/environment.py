@@ -14,6 +14,7 @@ from typing import Any
 
 from packaging.utils import canonicalize_name
 
+from armscan.tracking.tags import UNKNOWN
 from armscan.utils.files import PACKAGE_FOLDERS, sha256
 
 # Packages that a run's results may depend on; the environment file has the versions of all.
@@ -30,7 +31,6 @@ REPORTED_PACKAGES = (
     "hydra-core",
 )
 PYTHON, CONSTRAINTS_SUM = "version.python", "constraints.sha256"
-UNKNOWN = "unknown"
 HEADER = re.compile(r"^(Name|Version): *(\S+)", re.MULTILINE)
 
 

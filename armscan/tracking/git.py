@@ -11,11 +11,10 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from armscan.tracking.tags import COMMIT_TAG
+from armscan.tracking.tags import COMMIT_TAG, UNKNOWN
 from armscan.utils.files import sha256
 
 COMMIT, DIRTY, DIFF_SUM = "git.commit", "git.dirty", "git.diff.sha256"
-UNKNOWN = "unknown"
 # Largest untracked file that the diff includes: source code, but no volume beside it.
 MAX_UNTRACKED_BYTES = 2**20
 # Override the user's settings of `git diff`, which could break `git apply`.

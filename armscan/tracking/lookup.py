@@ -34,7 +34,7 @@ class FoundRun:
     """A run in the store.
 
     Args:
-        client: Client of the run's store.
+        store: Store of the run.
         uri: MLflow tracking URI, as the user typed it.
         experiment_id: MLflow experiment ID.
         run_id: MLflow run ID.
@@ -45,7 +45,7 @@ class FoundRun:
         needs_trust: Whether its configuration, judging by its parameters, can only be read with `--trust`.
     """
 
-    client: TrackingStore = field(repr=False)
+    store: TrackingStore = field(repr=False)
     uri: str
     experiment_id: str
     run_id: str
@@ -104,7 +104,7 @@ class FoundRun:
 
     def _fetched(self, file: str, folder: Path) -> Path:
         with store_errors(self.uri):
-            return Path(self.client.download_artifacts(self.run_id, file, str(folder)))
+            return Path(self.store.download_artifacts(self.run_id, file, str(folder)))
 
 
 def load_run(uri: str, run_id: str) -> FoundRun:
@@ -115,41 +115,41 @@ def load_run(uri: str, run_id: str) -> FoundRun:
             store does not exist or cannot be used.
     """
     check_run_id(run_id)
-    client = open_existing_store(uri)
+    store = open_existing_store(uri)
     with store_errors(uri):
-        run = find_run(client, run_id)
+        run = find_run(store, run_id)
         check_version(run)
-        children = client.children(run.info.experiment_id, run.info.run_id)
+        children = store.children(run.info.experiment_id, run.info.run_id)
         if jobs := [child.info.run_id for child in children if EVALUATED_TAG not in child.data.tags]:
             raise TrackingError(f"run {run.info.run_id} has runs below it: give one of them, {few(jobs)}")
         return FoundRun(
-            client=client,
+            store=store,
             uri=uri,
             experiment_id=run.info.experiment_id,
             run_id=run.info.run_id,
             name=run.info.run_name,
             status=run.info.status,
             tags=dict(run.data.tags),
-            files=tuple(artifact.path for artifact in client.list_artifacts(run.info.run_id)),
+            files=tuple(artifact.path for artifact in store.list_artifacts(run.info.run_id)),
             needs_trust=needs_trust(run.data.params),
         )
 
 
-def find_run(client: TrackingStore, run_id: str) -> Run:
+def find_run(store: TrackingStore, run_id: str) -> Run:
     """Return the run with an MLflow run ID, or with these first characters of it, in any experiment of a store.
 
     Raises:
         TrackingError: If no run or several runs match.
     """
     check_run_id(run_id)
-    experiments = all_pages(client.search_experiments)
-    found = client.search_runs(
+    experiments = all_pages(store.search_experiments)
+    found = store.search_runs(
         [experiment.experiment_id for experiment in experiments],
         filter_string=f"attributes.run_id LIKE '{run_id}%'",
         max_results=N_SHOWN + 1,
     )
     if not found:
-        raise TrackingError(f"the run is {run_id!r}, but no run of {client.uri} has an ID that begins with it")
+        raise TrackingError(f"the run is {run_id!r}, but no run of {store.uri} has an ID that begins with it")
     if len(found) > 1:
         ids = [run.info.run_id for run in found[:N_SHOWN]] + (["others"] if len(found) > N_SHOWN else [])
         raise TrackingError(f"the run is {run_id!r}, but that may be {listed(ids)}: give more of the ID")
@@ -158,12 +158,12 @@ def find_run(client: TrackingStore, run_id: str) -> Run:
 
 
 def run_of_study(
-    client: TrackingStore, run_id: str, *, experiment_id: str, tags: Mapping[str, str | None], where: str
+    store: TrackingStore, run_id: str, *, experiment_id: str, tags: Mapping[str, str | None], where: str
 ) -> Run:
     """Return a run that a study's storage names, once checked: an untrusted storage may name any run.
 
     Args:
-        client: Client of the store.
+        store: Tracking store.
         run_id: MLflow run ID.
         experiment_id: MLflow experiment of the study.
         tags: Required values of the run's tags, which show that it belongs to the study; None for a tag that it must
@@ -174,8 +174,8 @@ def run_of_study(
         TrackingError: If the run does not belong to the study, or is not in the store.
     """
     try:
-        with store_errors(client.uri):
-            run: Run = client.get_run(run_id)
+        with store_errors(store.uri):
+            run: Run = store.get_run(run_id)
     except TrackingUnavailableError:
         raise
     except TrackingError as error:

@@ -17,7 +17,7 @@ from armscan.tracking.notes import forget
 from armscan.tracking.outbox import Address, Outbox, file_of, now_ms
 from armscan.tracking.sanitize import params_of, tags_of
 from armscan.tracking.system_metrics import PREFIX, SystemMetrics
-from armscan.tracking.tags import FAILURE_TAG, PARENT_TAG, PRUNED_TAG
+from armscan.tracking.tags import FAILURE_TAG, PARENT_TAG, PRUNED_TAG, RESUMED_TAG
 from armscan.tracking.tracking_store import TrackingStore
 from armscan.tracking.uploader import Uploader
 from armscan.utils.files import atomic_write
@@ -120,11 +120,11 @@ class TrackedRun:
         """
         run_id = run.info.run_id
         store.check_artifacts_of(run)
-        if not (resumed := run.data.tags.get("resumed", "0")).isdecimal():
+        if not (resumed := run.data.tags.get(RESUMED_TAG, "0")).isdecimal():
             raise TrackingError(f"run {run_id}: its tag resumed is {resumed[:50]!r}, but it must be a whole number")
         n_resumed = int(resumed[:MAX_DIGITS]) + 1
         now = {**code_state().tags, **environment_tags()}
-        changed = {f"resumed.{key}": value for key, value in now.items() if run.data.tags.get(key) != value}
+        changed = {f"{RESUMED_TAG}.{key}": value for key, value in now.items() if run.data.tags.get(key) != value}
         had_outbox = file_of(folder, run_id).exists()
         outbox = Outbox.begin(folder, Address(run_id, store.uri))
         entries = list(outbox.entries())
@@ -137,9 +137,9 @@ class TrackedRun:
             logged = {(name, point.step) for name, points in histories.items() for point in points}
         tracked = cls(store, outbox, name=run.info.run_name or run_id, logged=logged)
         tracked.resume()
-        tracked.set_tags(dict(tags) | changed | {"resumed": str(n_resumed)})
+        tracked.set_tags(dict(tags) | changed | {RESUMED_TAG: str(n_resumed)})
         tracked._log_config(config, known=params)
-        if (diff := code_state().diff) and f"resumed.{DIFF_SUM}" in changed:
+        if (diff := code_state().diff) and f"{RESUMED_TAG}.{DIFF_SUM}" in changed:
             file = folder / RESUMED_DIFF_FILE.format(n_resumed)
             atomic_write(file, diff)
             tracked.log_files(file)

@@ -3,8 +3,12 @@
 # MLflow's own tags: the parent of a run, its description, and the commit of its code.
 PARENT_TAG, DESCRIPTION_TAG = "mlflow.parentRunId", "mlflow.note.content"
 COMMIT_TAG = "mlflow.source.git.commit"
-# Absolute path of a run's folder, and the name of its machine.
-FOLDER_TAG, HOST_TAG = "folder", "host"
+# Value of a tag that could not be found out.
+UNKNOWN = "unknown"
+# Absolute path of a run's folder, the name of its machine, and the folder in which it was started.
+FOLDER_TAG, HOST_TAG, WORKING_FOLDER_TAG = "folder", "host", "working_folder"
+# Command that started a run, and how often it was resumed.
+COMMAND_TAG, RESUMED_TAG = "command", "resumed"
 # Overrides of a run, as on its command line; of a study those of the latest command.
 OVERRIDES_TAG = "overrides"
 # Version of armscan that made a run.

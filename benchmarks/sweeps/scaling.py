@@ -122,7 +122,7 @@ def phase_of(storage_uri: str, tracking_uri: str | None, folder: Path, n_trials:
         seed=0,
         folder=folder,
         artifacts=folder / "artifacts",
-        client=store,
+        store=store,
         experiment_id=experiment_id,
         run_id="study",
     )

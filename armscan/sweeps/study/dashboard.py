@@ -26,7 +26,7 @@ LOCAL_UI = f"http://127.0.0.1:{MLFLOW_PORT}"
 
 def note_run(
     target: optuna.Study | Trial,
-    client: TrackingStore,
+    store: TrackingStore,
     experiment_id: str,
     run_id: str,
     folder: Path,
@@ -38,7 +38,7 @@ def note_run(
 
     Args:
         target: Study or trial that gets the note.
-        client: Client of the tracking store.
+        store: Tracking store.
         experiment_id: MLflow experiment ID of the run.
         run_id: MLflow run ID.
         folder: The folder of the study or the trial.
@@ -47,7 +47,7 @@ def note_run(
     # Deferred: it takes a second, and only workers and launchers need it.
     from optuna_dashboard import get_note, save_note
 
-    address = client.uri.rstrip("/") if client.uri.startswith("http") else LOCAL_UI
+    address = store.uri.rstrip("/") if store.uri.startswith("http") else LOCAL_UI
     link = f"[its run in MLflow]({address}/#/experiments/{experiment_id}/runs/{run_id})"
     begun = f"{link}, {run_id}\n\nits folder: `{folder.resolve()}`"
     note = f"{begun}\n\n{text}" if text else begun

@@ -65,7 +65,7 @@ def open_for_work(
         TrackingError: If the tracking store cannot be used.
     """
     retry_s = RETRY_S if retry else None
-    client, experiment_id = open_store(**to_plain(config.tracking), retry_s=retry_s)
+    store, experiment_id = open_store(**to_plain(config.tracking), retry_s=retry_s)
     for folder in (settings.folder, settings.artifacts):
         Path(folder).mkdir(parents=True, exist_ok=True)
     storage = open_storage(settings.storage, retry=retry)
@@ -86,11 +86,11 @@ def open_for_work(
         seed=settings.seed,
         folder=Path(settings.folder),
         artifacts=Path(settings.artifacts),
-        client=client,
+        store=store,
         experiment_id=experiment_id,
         # Workers do not know the volumes.
         run_id=_tracked_run(
-            study, storage, client, experiment_id, Path(settings.folder), overrides, is_command=volumes is not None
+            study, storage, store, experiment_id, Path(settings.folder), overrides, is_command=volumes is not None
         ),
         population=population,
     )
@@ -118,7 +118,7 @@ def _claim_folder(folder: Path, study: optuna.Study) -> None:
 def _tracked_run(
     study: optuna.Study,
     storage: Storage,
-    client: TrackingStore,
+    store: TrackingStore,
     experiment_id: str,
     folder: Path,
     overrides: Sequence[str],
@@ -134,22 +134,22 @@ def _tracked_run(
     @functools.cache
     def create_run() -> str:
         tags = {**code_state().tags, STUDY_TAG: name, STORAGE_TAG: storage.uri, OVERRIDES_TAG: typed}
-        return str(client.create_run(experiment_id, name=f"study {name}", tags=tags).info.run_id)
+        return str(store.create_run(experiment_id, name=f"study {name}", tags=tags).info.run_id)
 
     def tracked_run() -> str:
         if STUDY_RUN not in study.user_attrs:
             study.set_user_attr(STUDY_RUN, create_run())
-            note_run(study, client, experiment_id, create_run(), folder)
+            note_run(study, store, experiment_id, create_run(), folder)
             return create_run()
         run = run_of_study(
-            client,
+            store,
             study.user_attrs[STUDY_RUN],
             experiment_id=experiment_id,
             tags={STUDY_TAG: name, TRIAL_TAG: None},
             where=f"{name}.user_attrs.{STUDY_RUN}",
         )
         if is_command and run.data.tags.get(OVERRIDES_TAG) != typed:
-            client.set_tag(run.info.run_id, OVERRIDES_TAG, typed)
+            store.set_tag(run.info.run_id, OVERRIDES_TAG, typed)
         return str(run.info.run_id)
 
     return storage.exclusive(tracked_run)

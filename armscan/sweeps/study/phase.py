@@ -42,7 +42,7 @@ class Phase:
         seed: Seed of the samplers, combined with a trial's number.
         folder: Folder of the phase.
         artifacts: Folder of the plots; see `StudySettings`.
-        client: Client of the tracking store.
+        store: Tracking store.
         experiment_id: MLflow experiment ID of the tracked runs.
         run_id: MLflow run ID of the study.
         population: Population of which each trial trains a member. Default: None, trials are independent.
@@ -59,7 +59,7 @@ class Phase:
     seed: int
     folder: Path
     artifacts: Path
-    client: TrackingStore
+    store: TrackingStore
     experiment_id: str
     run_id: str
     population: Population | None = None
@@ -93,13 +93,13 @@ class Phase:
 
     def close_runs_of(self, trial: FrozenTrial) -> None:
         """Close the tracked runs that a dead worker has left open, except those that a retry has resumed."""
-        fail_dead_runs(trial_folder(self.folder, trial.number), self.client, WORKER_DIED)
+        fail_dead_runs(trial_folder(self.folder, trial.number), self.store, WORKER_DIED)
 
     def close_orphaned_runs(self) -> None:
         """Close runs whose workers ended before the run's ID was stored in the trial or in the folder of a seed."""
         # Read first: the runs of a trial that finishes meanwhile are closed by its worker.
         finished = self.scheduler.state().finished
-        running = self.client.runs(
+        running = self.store.runs(
             [self.experiment_id], f"tags.{STUDY_TAG} = '{self.name}' AND attributes.status = 'RUNNING'"
         )
         state = self.scheduler.state()
@@ -109,10 +109,10 @@ class Phase:
             run_id, tags = run.info.run_id, run.data.tags.items()
             # A study in another storage may have the same name.
             if any(self.tags_of(trial).items() <= tags for trial in failed):
-                self.client.set_tag(run_id, FAILURE_TAG, WORKER_DIED)
-                self.client.set_terminated(run_id, "FAILED")
+                self.store.set_tag(run_id, FAILURE_TAG, WORKER_DIED)
+                self.store.set_terminated(run_id, "FAILED")
             elif any(self.tags_of(trial).items() <= tags and trial.user_attrs.get(RUN) != run_id for trial in others):
-                self.client.set_terminated(run_id, "KILLED")
+                self.store.set_terminated(run_id, "KILLED")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -198,9 +198,9 @@ def _adopt(attempt: Attempt, seed: int) -> None:
     with folder_lock(folder):
         config, _ = attempt.config(seed)
         if found := _begun(folder, attempt, config):
-            client, run = found
+            store, run = found
             for tag, value in _tags_of(attempt, folder).items():
-                client.set_tag(run.info.run_id, tag, value)
+                store.set_tag(run.info.run_id, tag, value)
 
 
 def _tags_of(attempt: Attempt, folder: Path) -> dict[str, str]:
@@ -219,9 +219,9 @@ def _start_or_resume(
     agent = setup.agent
     assert isinstance(agent, Learner)
     if found := _begun(folder, attempt, config):
-        client, run = found
+        store, run = found
         tags = volume_tags(setup) | _tags_of(attempt, folder)
-        reopen = partial(TrackedRun.reopen, client, run, folder=folder, config=to_plain(config), tags=tags)
+        reopen = partial(TrackedRun.reopen, store, run, folder=folder, config=to_plain(config), tags=tags)
         if (folder / LAST_CHECKPOINT).exists():
             try:
                 earlier = resume_from_checkpoint(agent, folder, setup.provenance(run.info.run_id))
@@ -258,20 +258,20 @@ def _begun_in(folder: Path, attempt: Attempt, config: DictConfig) -> tuple[Track
     """
     if not (file := folder / RUN_FILE).exists():
         return None
-    client, experiment_id = open_store(**to_plain(config.tracking), retry_s=RETRY_S)
-    known = partial(run_of_study, client, experiment_id=experiment_id, where=str(file))
+    store, experiment_id = open_store(**to_plain(config.tracking), retry_s=RETRY_S)
+    known = partial(run_of_study, store, experiment_id=experiment_id, where=str(file))
     tags = {STUDY_TAG: attempt.tags[STUDY_TAG], "seed": str(config.seed)}
     try:
         run = known(json.loads(file.read_text())["run_id"], tags=tags)
         # An earlier attempt had another trial number and another run of the trial, but below the same run of the study.
-        study_run_id = client.get_run(attempt.run_id).data.tags[PARENT_TAG]
+        study_run_id = store.get_run(attempt.run_id).data.tags[PARENT_TAG]
         known(run.data.tags.get(PARENT_TAG, ""), tags={PARENT_TAG: study_run_id})
     except TrackingUnavailableError:
         raise
     except TrackingError as error:
         log(f"trial {attempt.trial.number} does not resume from {folder}: {error}")
         return None
-    return client, run
+    return store, run
 
 
 def _take_over(run_id: str, before: Path, folder: Path) -> None:

@@ -62,14 +62,14 @@ def run_workers(opened: OpenedStudy, given: StudyCommand, launcher: str, launch:
         print_sentence(f"study {search.name} in {search.scheduler.storage.uri}: nothing is left to do")
         if _has_finished(opened):
             # Trusted: see `_upload`.
-            sync(opened.folder, lambda _: search.client, trust=True)
+            sync(opened.folder, lambda _: search.store, trust=True)
             return
     started = f"{datetime.now():%Y-%m-%d_%H-%M-%S}_{socket.gethostname()}_{os.getpid()}"
     folder = working_folder() / opened.folder / "workers" / started
     folder.mkdir(parents=True)
     ProcessInfo.current(str(working_folder())).write(folder / LAUNCHER_FILE)
     arguments = _arguments(opened, given, launcher, folder)
-    tracked = TrackedRun.open_existing(search.client, search.run_id, name=opened.settings.name, folder=folder)
+    tracked = TrackedRun.open_existing(search.store, search.run_id, name=opened.settings.name, folder=folder)
     tracked.resume()
     leave_s = LEAVE_S if launcher in ON_THIS_MACHINE else LEAVE_ELSEWHERE_S
     with _leaving(opened, folder, tracked, leave_s, monitor):
@@ -200,7 +200,7 @@ def _conclude(opened: OpenedStudy, tracked: TrackedRun, monitor: StudyMonitor) -
         if note:
             tracked.set_description(note)
             note_run(
-                search, opened.search.client, opened.search.experiment_id, opened.search.run_id, opened.folder, note
+                search, opened.search.store, opened.search.experiment_id, opened.search.run_id, opened.folder, note
             )
     if failure:
         return "FAILED", failure
@@ -211,16 +211,16 @@ def _conclude(opened: OpenedStudy, tracked: TrackedRun, monitor: StudyMonitor) -
 
 def _has_finished(opened: OpenedStudy) -> bool:
     """Return whether the study's run has ended with its result."""
-    client = opened.search.client
-    with store_errors(client.uri):
-        return str(client.get_run(opened.search.run_id).info.status) == "FINISHED"
+    store = opened.search.store
+    with store_errors(store.uri):
+        return str(store.get_run(opened.search.run_id).info.status) == "FINISHED"
 
 
 def _has_result(opened: OpenedStudy) -> bool:
     """Return whether the study's run has the metrics of a result, perhaps an earlier one."""
-    client = opened.search.client
-    with store_errors(client.uri):
-        metrics = client.get_run(opened.search.run_id).data.metrics
+    store = opened.search.store
+    with store_errors(store.uri):
+        metrics = store.get_run(opened.search.run_id).data.metrics
     return any(name.startswith(f"{TEST_METRICS}/") for name in metrics)
 
 
@@ -230,15 +230,15 @@ def _upload(opened: OpenedStudy, monitor: StudyMonitor, tracked: TrackedRun, sta
     left = []
     if is_there:
         # Trusted: anyone who may write into the folder of a study can execute code in it anyway.
-        uploads = sync(opened.folder, lambda _: opened.search.client, trust=True)
+        uploads = sync(opened.folder, lambda _: opened.search.store, trust=True)
         # Runs in use are those of another command, which uploads them.
         left = [each.folder for each in uploads if each.left not in (None, IN_USE)]
-        client = opened.search.client
-        with contextlib.suppress(ArmscanError), no_retry(), store_errors(client.uri):
+        store = opened.search.store
+        with contextlib.suppress(ArmscanError), no_retry(), store_errors(store.uri):
             for phase in opened.phases:
                 phase.close_orphaned_runs()
             if monitor.is_worked_on():
-                client.update_run(opened.search.run_id, status="RUNNING")
+                store.update_run(opened.search.run_id, status="RUNNING")
     if not is_there or left:
         print(
             f"not everything was uploaded: {armscan_command('runs', 'sync', str(opened.folder))} uploads the rest",

@@ -45,15 +45,15 @@ def open_run(
         tags["trial.retry_of"] = str(attributes[RETRY_OF])
     if RUN in attributes:
         run = run_of_study(
-            phase.client,
+            phase.store,
             attributes[RUN],
             experiment_id=phase.experiment_id,
             tags={STUDY_TAG: phase.name, TRIAL_TAG: str(trial.number), PARENT_TAG: phase.run_id},
             where=f"{phase.name}.trials[{trial.number}].user_attrs.{RUN}",
         )
-        return TrackedRun.reopen(phase.client, run, folder=folder, config={}, tags=tags)
+        return TrackedRun.reopen(phase.store, run, folder=folder, config={}, tags=tags)
     tracked = TrackedRun.start(
-        phase.client,
+        phase.store,
         phase.experiment_id,
         name=f"{phase.name}-{trial.number:04d}",
         config=values,
@@ -62,7 +62,7 @@ def open_run(
         parent_id=phase.run_id,
     )
     # Before the trial's run ID is written: a trial that has one writes no note.
-    writes.append(partial(note_run, trial, phase.client, phase.experiment_id, tracked.run_id, folder))
+    writes.append(partial(note_run, trial, phase.store, phase.experiment_id, tracked.run_id, folder))
     writes.append(partial(trial.set_user_attr, RUN, tracked.run_id))
     return tracked
 

@@ -175,7 +175,7 @@ class Worker:
             n_env_steps = max(attempt.env_steps, int(trial.user_attrs.get(ENV_STEPS, 0)))
             writes.append(partial(trial.set_user_attr, ENV_STEPS, n_env_steps))
             if attempt.seeds_done:
-                where = phase.client, phase.experiment_id, self._tracked.run_id, folder
+                where = phase.store, phase.experiment_id, self._tracked.run_id, folder
                 writes.append(partial(note_run, trial, *where, table_of_seeds(attempt.seeds_done)))
 
     def _opened(self, training: TrackedRun | None) -> None:

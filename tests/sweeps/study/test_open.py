@@ -37,7 +37,7 @@ def test_run_of_a_study_that_is_anothers_is_refused_and_left_as_it_is(opened, ki
 def note_result(search, result):
     """Add a result to a study's note, as its launcher does; return the note that the dashboard shows."""
     study = search.scheduler.study
-    note_run(study, search.client, search.experiment_id, search.run_id, search.folder, result)
+    note_run(study, search.store, search.experiment_id, search.run_id, search.folder, result)
     return get_note(study)
 
 

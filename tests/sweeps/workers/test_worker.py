@@ -72,12 +72,12 @@ def make_phase(tmp_path, empty_database):
         )
         if not (folder / "a.db").exists():
             shutil.copy(empty_database, folder / "a.db")
-        client, experiment_id = open_store(
+        store, experiment_id = open_store(
             f"sqlite:///{folder}/a.db", experiment="a", artifacts=str(folder / "b"), wait_s=60.0
         )
         # As each start of a study finds it.
-        there = client.search_runs([experiment_id], "tags.kind = 'study'")
-        own = there[0] if there else client.create_run(experiment_id, name="study", tags={"kind": "study"})
+        there = store.search_runs([experiment_id], "tags.kind = 'study'")
+        own = there[0] if there else store.create_run(experiment_id, name="study", tags={"kind": "study"})
         return Phase(
             name=name,
             scheduler=TrialScheduler(study, storage, Limits(**{"n_trials": 5} | limits), plan),
@@ -90,7 +90,7 @@ def make_phase(tmp_path, empty_database):
             seed=seed,
             folder=folder,
             artifacts=folder / "artifacts",
-            client=client,
+            store=store,
             experiment_id=experiment_id,
             run_id=own.info.run_id,
         )
@@ -285,7 +285,7 @@ def test_worker_that_is_told_to_leave_while_it_opens_a_tracked_run_leaves_a_tria
     with beating.running():
         Worker(phase, ["data.n_training=1"], beating).work()
     (trial,) = phase.scheduler.study.trials
-    (run,) = phase.client.runs([phase.experiment_id], "tags.trial = '0'")
+    (run,) = phase.store.runs([phase.experiment_id], "tags.trial = '0'")
     assert trial.state.name == "COMPLETE"
     assert run.info.run_id == trial.user_attrs[RUN]
     assert run.info.status == "FINISHED"
