@@ -16,7 +16,7 @@ import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
@@ -34,6 +34,9 @@ from armscan.launch.job_process import start_job
 from armscan.launch.launchers import ON_THIS_MACHINE, launcher_error
 from armscan.launch.multirun import Multirun, end_grid, print_resume_command
 from armscan.utils.log import silence_libraries
+
+if TYPE_CHECKING:
+    from armscan.launch.resume import GridToRepeat
 
 
 def run(config: DictConfig) -> None:
@@ -90,16 +93,10 @@ def launch(arguments: Sequence[str]) -> None:
         raise launcher_error(launcher, error) from error
 
 
-def repeat_grid(overrides: Sequence[str], run_id: str, *, trust: bool) -> None:
-    """Run the jobs of a grid that have not finished.
-
-    Args:
-        overrides: Overrides that repeat it.
-        run_id: MLflow run ID of its parent run.
-        trust: Whether its jobs may build any class.
-    """
-    Multirun.repeats, Multirun.is_trusted = run_id, trust
-    launch([MULTIRUN[0], *overrides])
+def repeat_grid(grid: GridToRepeat) -> None:
+    """Run the jobs of a grid that have not finished."""
+    Multirun.repeats, Multirun.is_trusted = grid.run_id, grid.trust
+    launch([MULTIRUN[0], *grid.overrides])
 
 
 def _end_interrupted() -> None:
@@ -142,9 +139,10 @@ def main() -> int:
             return 0
         if any(each.startswith(f"{RESUME}=") for each in sys.argv[1:]):
             # Before Hydra composes a configuration and creates a folder: a resumed run has both.
-            from armscan.experiment.resume import resume
+            from armscan.launch.resume import resume
 
-            resume(sys.argv[1:], repeat_grid)
+            if grid := resume(sys.argv[1:]):
+                repeat_grid(grid)
         else:
             arguments = with_folds(sys.argv[1:])
             check_grid(arguments)

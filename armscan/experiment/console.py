@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from rich.text import Text
 
 from armscan.config.command_hints import STARTED_IN, armscan_command
-from armscan.experiment.job import INTERRUPTED, JobOutcome
-from armscan.experiment.results import TITLES
-from armscan.training import TEST, MetricEstimates, ResultTable
-from armscan.training.baselines import RANDOM
-from armscan.training.headline import headline
-from armscan.training.result_table import with_baselines
+from armscan.training import ResultTable
 from armscan.utils.console import print_sentence, wide_console
-from armscan.utils.run_files import ID_CHARS
 
 
 def print_result_table(
@@ -40,49 +34,6 @@ def print_result_table(
         print_sentence(f"note: {note}")
     if table.headline:
         print_sentence(f"result{of and f' ({of})'}: {table.headline}")
-
-
-def print_jobs(outcomes: Mapping[str, JobOutcome], run_ids: Mapping[str, str], *, have_same_task: bool) -> ResultTable:
-    """Print the table of a grid's jobs, and return it.
-
-    Args:
-        outcomes: Outcome of each job, by its number.
-        run_ids: MLflow run ID of each job that started a run, by its number.
-        have_same_task: Whether all jobs have the same task and test volumes; otherwise the best of them is the easiest,
-            and the table has no headline.
-    """
-    table = jobs_table(outcomes, run_ids, have_same_task=have_same_task)
-    print_result_table(f"jobs ({TEST})", table)
-    return table
-
-
-def jobs_table(outcomes: Mapping[str, JobOutcome], run_ids: Mapping[str, str], *, have_same_task: bool) -> ResultTable:
-    """Return the table of a grid's jobs, with the baselines below them; see `print_jobs`."""
-    figures = {
-        number: {name: MetricEstimates.of_metrics(metrics) for name, metrics in outcome.metrics.items()}
-        for number, outcome in outcomes.items()
-    }
-    tested = {number: each.pop(TEST, MetricEstimates.of_metrics({})) for number, each in figures.items()}
-    baselines = {
-        number: {name: of_name for name, of_name in each.items() if name not in TITLES}
-        for number, each in figures.items()
-        if each
-    }
-    results = with_baselines(tested, baselines)
-    ended = {None: "done", INTERRUPTED: INTERRUPTED}
-    facts = {
-        "run": [run_ids.get(number, "-")[:ID_CHARS] for number in outcomes],
-        "overrides": [outcome.varied for outcome in outcomes.values()],
-        "outcome": [ended.get(outcome.failure, "failed") for outcome in outcomes.values()],
-    }
-    n_baselines = len(results) - len(outcomes)
-    names = {number: f"{number} ({outcome.varied})" for number, outcome in outcomes.items()}
-    randoms = {names[number]: each[RANDOM] for number, each in baselines.items() if RANDOM in each}
-    return ResultTable(
-        results,
-        {heading: [*values, *[""] * n_baselines] for heading, values in facts.items()},
-        headline({names[number]: each for number, each in tested.items()}, randoms) if have_same_task else "",
-    )
 
 
 def print_where_to_look(

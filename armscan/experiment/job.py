@@ -12,7 +12,7 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
@@ -24,7 +24,7 @@ from armscan.utils.files import atomic_write, sha256
 from armscan.utils.processes import ProcessInfo
 from armscan.utils.run_files import CONFIG_FILE, LOCK_FILE, OUTBOX_FOLDER, OUTBOX_SUFFIXES, RUN_ID_PATTERN
 
-PARENT_FILE = "parent_run.json"
+GRID_FILE = "grid.json"
 OUTCOME_FOLDER = "outcomes"
 NO_OUTCOME, INTERRUPTED = "ended without an outcome", "interrupted"
 
@@ -44,6 +44,51 @@ class JobOutcome:
     varied: str
     failure: str | None = None
     metrics: dict[str, dict[str, float]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grid:
+    """A grid, as its folder keeps it for its jobs and for its end.
+
+    Args:
+        run_id: MLflow run ID of its run, the parent of its jobs' runs.
+        tracking: Section `tracking` of its configuration.
+        overrides: Its overrides.
+        shared: Overrides that all jobs share, as Hydra spells them for a job.
+        has_known_jobs: Whether its jobs follow from its overrides, as those of Hydra's own sweeper do.
+        resume_needs_trust: Whether it can only be resumed with `--trust`.
+        repeats: MLflow run ID of the grid that it repeats without its finished jobs. Default: None, a new grid.
+        is_trusted: Whether its jobs may build any class; false if its overrides were stored and not trusted.
+            Default: True.
+        launcher: Process that launches the jobs, which end with it. Default: None, they go on without it, as on a
+            cluster.
+    """
+
+    run_id: str
+    tracking: dict[str, Any]
+    overrides: list[str]
+    shared: list[str]
+    has_known_jobs: bool = True
+    resume_needs_trust: bool = False
+    repeats: str | None = None
+    is_trusted: bool = True
+    launcher: ProcessInfo | None = None
+
+    @classmethod
+    def read(cls, folder: Path) -> Self:
+        """Read the grid of a folder."""
+        values = json.loads((folder / GRID_FILE).read_text())
+        launcher = ProcessInfo.of(values["launcher"]) if values["launcher"] else None
+        return cls(**values | {"launcher": launcher})
+
+    def write(self, folder: Path) -> None:
+        """Write the grid into its folder."""
+        (folder / GRID_FILE).write_text(json.dumps(asdict(self)))
+
+    @property
+    def uri(self) -> str:
+        """Address of its tracking store."""
+        return str(self.tracking["uri"])
 
 
 @dataclass(frozen=True)
@@ -78,13 +123,16 @@ class Job:
         if hydra_config.mode != RunMode.MULTIRUN:
             return None
         folder = Path(hydra_config.sweep.dir)
-        parent = json.loads((folder / PARENT_FILE).read_text())
-        overrides = list(hydra_config.overrides.task)
-        varied = [override for override in overrides if override not in parent["common"]]
-        launcher = ProcessInfo.of(parent["launcher"]) if parent["launcher"] else None
-        repeated = parent["repeats"], parent["is_trusted"]
+        grid, overrides = Grid.read(folder), list(hydra_config.overrides.task)
         return cls(
-            hydra_config.job.num, shlex.join(overrides), " ".join(varied), parent["run_id"], folder, *repeated, launcher
+            hydra_config.job.num,
+            shlex.join(overrides),
+            " ".join(override for override in overrides if override not in grid.shared),
+            grid.run_id,
+            folder,
+            grid.repeats,
+            grid.is_trusted,
+            grid.launcher,
         )
 
     @property
@@ -176,7 +224,7 @@ def remove_run_folder(folder: Path) -> None:
     for ours in (folder / ".hydra", folder / OUTCOME_FOLDER):
         shutil.rmtree(ours, ignore_errors=True)
     outboxes = [file for suffix in OUTBOX_SUFFIXES for file in (folder / OUTBOX_FOLDER).glob(RUN_ID_PATTERN + suffix)]
-    for ours in (folder / PARENT_FILE, folder / "multirun.yaml", folder / LOCK_FILE, *outboxes):
+    for ours in (folder / GRID_FILE, folder / "multirun.yaml", folder / LOCK_FILE, *outboxes):
         ours.unlink(missing_ok=True)
     # Another run's outbox is not empty.
     with contextlib.suppress(OSError):

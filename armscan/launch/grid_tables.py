@@ -9,7 +9,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from armscan.config.defaults import FOLD
 from armscan.config.error_messages import one_line_message
@@ -17,31 +17,76 @@ from armscan.config.own_code import mixed_modules
 from armscan.config.task import have_same_task
 from armscan.errors import TrackingError, few
 from armscan.experiment.console import print_result_table
-from armscan.experiment.job import JobOutcome
-from armscan.experiment.results import few_subjects
+from armscan.experiment.job import INTERRUPTED, Grid, JobOutcome
+from armscan.experiment.results import TITLES, few_subjects
 from armscan.launch.folds_table import AGENT, ALL_FOLDS, folds_table
 from armscan.launch.grid_jobs import jobs_of
 from armscan.reports.html import page
 from armscan.tracking.outbox import now_ms
 from armscan.tracking.tags import FOLDER_TAG, JOB_TAG, OWN_CODE_TAG
 from armscan.tracking.uploader import set_description
+from armscan.training import TEST, MetricEstimates, ResultTable
+from armscan.training.baselines import RANDOM
 from armscan.training.episode_results import TEST_METRICS, metric_prefix
-from armscan.training.headline import ABOVE_RANDOM
+from armscan.training.headline import ABOVE_RANDOM, headline
+from armscan.training.result_table import with_baselines
 from armscan.utils.files import atomic_write
-from armscan.utils.run_files import RESULTS_PAGE
+from armscan.utils.run_files import ID_CHARS, RESULTS_PAGE
 from armscan.utils.text import counted
 
 if TYPE_CHECKING:
     from mlflow.entities import Run
 
     from armscan.tracking import TrackingStore
-    from armscan.training import ResultTable
+
+
+def print_jobs(outcomes: Mapping[str, JobOutcome], run_ids: Mapping[str, str], *, have_same_task: bool) -> ResultTable:
+    """Print the table of a grid's jobs, and return it.
+
+    Args:
+        outcomes: Outcome of each job, by its number.
+        run_ids: MLflow run ID of each job that started a run, by its number.
+        have_same_task: Whether all jobs have the same task and test volumes; otherwise the best of them is the easiest,
+            and the table has no headline.
+    """
+    table = jobs_table(outcomes, run_ids, have_same_task=have_same_task)
+    print_result_table(f"jobs ({TEST})", table)
+    return table
+
+
+def jobs_table(outcomes: Mapping[str, JobOutcome], run_ids: Mapping[str, str], *, have_same_task: bool) -> ResultTable:
+    """Return the table of a grid's jobs, with the baselines below them; see `print_jobs`."""
+    figures = {
+        number: {name: MetricEstimates.of_metrics(metrics) for name, metrics in outcome.metrics.items()}
+        for number, outcome in outcomes.items()
+    }
+    tested = {number: each.pop(TEST, MetricEstimates.of_metrics({})) for number, each in figures.items()}
+    baselines = {
+        number: {name: of_name for name, of_name in each.items() if name not in TITLES}
+        for number, each in figures.items()
+        if each
+    }
+    results = with_baselines(tested, baselines)
+    ended = {None: "done", INTERRUPTED: INTERRUPTED}
+    facts = {
+        "run": [run_ids.get(number, "-")[:ID_CHARS] for number in outcomes],
+        "overrides": [outcome.varied for outcome in outcomes.values()],
+        "outcome": [ended.get(outcome.failure, "failed") for outcome in outcomes.values()],
+    }
+    n_baselines = len(results) - len(outcomes)
+    names = {number: f"{number} ({outcome.varied})" for number, outcome in outcomes.items()}
+    randoms = {names[number]: each[RANDOM] for number, each in baselines.items() if RANDOM in each}
+    return ResultTable(
+        results,
+        {heading: [*values, *[""] * n_baselines] for heading, values in facts.items()},
+        headline({names[number]: each for number, each in tested.items()}, randoms) if have_same_task else "",
+    )
 
 
 def keep_tables(
     table: ResultTable,
     folder: Path,
-    parent: Mapping[str, Any],
+    grid: Grid,
     outcomes: Mapping[str, JobOutcome],
     runs: Sequence[Run],
     store: TrackingStore,
@@ -50,24 +95,24 @@ def keep_tables(
     from mlflow.exceptions import MlflowException
 
     try:
-        planned = jobs_of(parent["overrides"])[1] if parent["has_known_jobs"] else None
+        planned = jobs_of(grid.overrides)[1] if grid.has_known_jobs else None
         n_jobs = len(outcomes) if planned is None else len(planned)
         n_finished = sum(outcome.failure is None for outcome in outcomes.values())
         finished = [run for run in runs if outcomes[run.data.tags[JOB_TAG]].failure is None]
         mixed = mixed_modules(run.data.tags.get(OWN_CODE_TAG) for run in finished)
         on_code = [f"the jobs used different versions of {few(mixed)} (tag {OWN_CODE_TAG})"] if mixed else []
-        if planned is not None and (pooled := _pooled_folds(parent, outcomes, finished, planned)) is not None:
+        if planned is not None and (pooled := _pooled_folds(grid, outcomes, finished, planned)) is not None:
             of_folds, notes = pooled[0], [*pooled[1], *on_code]
             print_result_table(f"{next(iter(of_folds.results)).split(', ')[1]} (test)", of_folds, notes)
-            keep_folds_table(of_folds, table, folder, store, parent["run_id"], notes)
+            keep_folds_table(of_folds, table, folder, store, grid.run_id, notes)
         else:
             missing = [f"of {n_jobs} jobs, {n_jobs - n_finished} without a result"] if n_finished < n_jobs else []
             notes = [*missing, *on_code]
             for note in notes:
                 print(f"note: {note}")
-            body = f"<p><code>{html.escape(' '.join(parent['overrides']))}</code></p>{table.html()}"
+            body = f"<p><code>{html.escape(' '.join(grid.overrides))}</code></p>{table.html()}"
             text = page(f"Grid of {counted(n_jobs, 'job')}", body, notes=notes)
-            _keep_page(folder, text, "\n\n".join([*notes, table.markdown()]), store, parent["run_id"])
+            _keep_page(folder, text, "\n\n".join([*notes, table.markdown()]), store, grid.run_id)
     except (TrackingError, MlflowException, OSError) as error:
         print(f"the tables of the grid are not kept: {one_line_message(error) or error}", file=sys.stderr)
 
@@ -117,17 +162,17 @@ def _keep_page(folder: Path, text: str, description: str, store: TrackingStore, 
 
 
 def _pooled_folds(
-    parent: Mapping[str, Any],
+    grid: Grid,
     outcomes: Mapping[str, JobOutcome],
     finished: Sequence[Run],
     jobs: Sequence[Sequence[str]],
 ) -> tuple[ResultTable, list[str]] | None:
     """Return one table over all folds of a cross-validation, and notes on it; None of another grid."""
-    if not any(override.startswith(f"{FOLD}=") for override in parent["overrides"]):
+    if not any(override.startswith(f"{FOLD}=") for override in grid.overrides):
         return None
     planned = [dict(override.partition("=")[::2] for override in job) for job in jobs]
     varied = {
-        number: [override for override in shlex.split(outcome.overrides) if override not in parent["common"]]
+        number: [override for override in shlex.split(outcome.overrides) if override not in grid.shared]
         for number, outcome in outcomes.items()
     }
     tested = [(Path(run.data.tags[FOLDER_TAG]), varied[run.data.tags[JOB_TAG]]) for run in finished]

@@ -6,7 +6,7 @@ import json
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,7 +26,7 @@ from armscan.experiment.job import (
     INTERRUPTED,
     NO_OUTCOME,
     OUTCOME_FOLDER,
-    PARENT_FILE,
+    Grid,
     JobOutcome,
     remove_run_folder,
 )
@@ -116,16 +116,19 @@ class Multirun(Callback):
         run = store.create_run(experiment_id, name=f"grid {command}"[:250], tags=tags)
         if Multirun.repeats is not None:
             store.set_tag(Multirun.repeats, CONTINUED_TAG, run.info.run_id)
-        parent = {"run_id": run.info.run_id, "tracking": tracking, "overrides": overrides}
-        parent |= {"common": shared_overrides(OverridesParser.create().parse_overrides([*overrides]))}
-        parent |= {"repeats": Multirun.repeats, "is_trusted": Multirun.is_trusted}
-        # Only of Hydra's own sweeper, the jobs are known.
-        parent |= {"has_known_jobs": config.hydra.runtime.choices["hydra/sweeper"] == "basic"}
-        parent |= {"launcher": asdict(ProcessInfo.current()) if launcher in ON_THIS_MACHINE else None}
-        # Also if it was resumed with --trust.
-        is_told = Multirun.repeats is not None and Multirun.is_trusted
-        parent |= {"trust": is_told or untrusted_override(again, tracking["uri"]) is not None}
-        (folder / PARENT_FILE).write_text(json.dumps(parent))
+        was_resumed_with_trust = Multirun.repeats is not None and Multirun.is_trusted
+        grid = Grid(
+            run_id=run.info.run_id,
+            tracking=tracking,
+            overrides=overrides,
+            shared=shared_overrides(OverridesParser.create().parse_overrides([*overrides])),
+            has_known_jobs=config.hydra.runtime.choices["hydra/sweeper"] == "basic",
+            resume_needs_trust=was_resumed_with_trust or untrusted_override(again, tracking["uri"]) is not None,
+            repeats=Multirun.repeats,
+            is_trusted=Multirun.is_trusted,
+            launcher=ProcessInfo.current() if launcher in ON_THIS_MACHINE else None,
+        )
+        grid.write(folder)
         Multirun.folder, Multirun.outbox = folder, begin_outbox(folder, run.info.run_id, tracking["uri"])
         Multirun.launcher = launcher
 
@@ -159,28 +162,28 @@ def end_grid(*, is_interrupted: bool = False) -> int:
     outcomes |= {number: replace(failed.pop(number), failure=INTERRUPTED) for number in interrupted}
     has_failed = bool(failed) or not outcomes
     status = "KILLED" if is_interrupted or (interrupted and not has_failed) else "FAILED" if has_failed else "FINISHED"
-    parent = json.loads((folder / PARENT_FILE).read_text())
+    grid = Grid.read(folder)
     try:
-        store, runs = _close_parent(folder, parent, status, outcomes)
+        store, runs = _close_parent(folder, grid, status, outcomes)
     except TrackingError as error:
         print(f"{error}; {armscan_command('runs', 'sync', str(folder))} uploads the rest", file=sys.stderr)
         store, runs = None, []
     if outcomes:
-        from armscan.experiment.console import print_jobs, print_where_to_look
-        from armscan.launch.grid_tables import keep_tables
+        from armscan.experiment.console import print_where_to_look
+        from armscan.launch.grid_tables import keep_tables, print_jobs
 
         run_ids = {run.data.tags[JOB_TAG]: run.info.run_id for run in runs}
         table = print_jobs(outcomes, run_ids, have_same_task=have_same_task(run.data.params for run in runs))
         if store is not None and runs:
-            keep_tables(table, folder, parent, outcomes, runs, store)
-            print_where_to_look(folder, parent["tracking"]["uri"], files=(RESULTS_PAGE, ""))
-            compare = armscan_command("report", "--runs", parent["run_id"], tracking=parent["tracking"]["uri"])
+            keep_tables(table, folder, grid, outcomes, runs, store)
+            print_where_to_look(folder, grid.uri, files=(RESULTS_PAGE, ""))
+            compare = armscan_command("report", "--runs", grid.run_id, tracking=grid.uri)
             print(f"compare   {compare}")
     for number, outcome in failed.items():
         print(f"job {number} failed: {outcome.failure}", file=sys.stderr)
         print(f"  run it alone with: {run_command([])} {outcome.overrides}", file=sys.stderr)
     if status != "FINISHED":
-        _print_resume_commands(parent, runs)
+        _print_resume_commands(grid, runs)
     if store is not None and not runs:
         remove_run_folder(folder)
         if is_interrupted:
@@ -191,8 +194,8 @@ def end_grid(*, is_interrupted: bool = False) -> int:
 def print_resume_command() -> None:
     """Print the command that resumes a grid that could not be closed."""
     if Multirun.folder is not None:
-        parent = json.loads((Multirun.folder / PARENT_FILE).read_text())
-        again = resume_command(parent["run_id"], parent["tracking"]["uri"], trust=parent["trust"])
+        grid = Grid.read(Multirun.folder)
+        again = resume_command(grid.run_id, grid.uri, trust=grid.resume_needs_trust)
         print(f"the grid was not closed; resume it with: {again}", file=sys.stderr)
 
 
@@ -202,20 +205,19 @@ def _read_outcomes(folder: Path) -> dict[str, JobOutcome]:
     return {file.stem: JobOutcome(**json.loads(file.read_text())) for file in files}
 
 
-def _print_resume_commands(parent: Mapping[str, Any], runs: Sequence[Run]) -> None:
+def _print_resume_commands(grid: Grid, runs: Sequence[Run]) -> None:
     """Print the commands that resume the jobs that have not finished."""
-    uri = parent["tracking"]["uri"]
     for run in runs:
         if run.info.status != "FINISHED" and (Path(run.data.tags[FOLDER_TAG]) / LAST_CHECKPOINT).exists():
-            again = resume_command(run.info.run_id, uri, trust=needs_trust(run.data.params))
+            again = resume_command(run.info.run_id, grid.uri, trust=needs_trust(run.data.params))
             print(f"resume job {run.data.tags[JOB_TAG]} with: {again}", file=sys.stderr)
     if runs:
-        again = resume_command(parent["run_id"], uri, trust=parent["trust"])
+        again = resume_command(grid.run_id, grid.uri, trust=grid.resume_needs_trust)
         print(f"resume all with: {again}", file=sys.stderr)
 
 
 def _close_parent(
-    folder: Path, parent: Mapping[str, Any], status: str, outcomes: Mapping[str, JobOutcome]
+    folder: Path, grid: Grid, status: str, outcomes: Mapping[str, JobOutcome]
 ) -> tuple[TrackingStore, list[Run]]:
     """Close the parent run and the open runs of killed jobs; delete the parent if no job has started a run.
 
@@ -228,11 +230,11 @@ def _close_parent(
     tags = {f"failure.{number}": f"{each.varied}: {each.failure}" for number, each in failed.items()}
     if Multirun.outbox is not None:
         Multirun.outbox.close()
-    note_end(folder, parent["run_id"], parent["tracking"]["uri"], status, tags)
-    store, experiment_id = open_store(**parent["tracking"], retry_s=parent["tracking"]["wait_s"])
+    note_end(folder, grid.run_id, grid.uri, status, tags)
+    store, experiment_id = open_store(**grid.tracking, retry_s=grid.tracking["wait_s"])
     # Uploads what the jobs could not while the store was unavailable.
     sync(folder, lambda _: store)
-    below = store.children(experiment_id, parent["run_id"])
+    below = store.children(experiment_id, grid.run_id)
     # Users may have nested other runs below it.
     children = [run for run in below if run.data.tags.get(JOB_TAG, "").isdecimal() and FOLDER_TAG in run.data.tags]
     for child in children:
@@ -244,8 +246,8 @@ def _close_parent(
             store.set_tag(child.info.run_id, FAILURE_TAG, reason)
             store.set_terminated(child.info.run_id, "KILLED" if is_killed else "FAILED")
     if not children:
-        store.delete_run(parent["run_id"])
+        store.delete_run(grid.run_id)
     else:
         done = {number for number, outcome in outcomes.items() if outcome.failure is None}
-        log_best(store, parent["run_id"], [child for child in children if child.data.tags[JOB_TAG] in done])
+        log_best(store, grid.run_id, [child for child in children if child.data.tags[JOB_TAG] in done])
     return store, sorted(children, key=lambda child: int(child.data.tags[JOB_TAG]))

@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from armscan.errors import ResumeError, UntrustedError
-from armscan.experiment.resume import resume
+from armscan.launch.resume import resume
 from armscan.policies.build import SUM_TAG
 from armscan.policies.model import CODE, model_sha256
 from armscan.tracking.outbox import Address, Outbox
@@ -77,7 +77,7 @@ def test_no_command_executes_what_a_run_names(armscan, tmp_path, door, section):
         assert not marker.exists(), name
     store_of(tmp_path).set_terminated(run_id, "KILLED")
     with pytest.raises(UntrustedError, match=line):
-        resume([f"resume={run_id}"], list)
+        resume([f"resume={run_id}"])
     assert not marker.exists()
 
 
@@ -99,7 +99,7 @@ def test_configuration_that_was_made_to_harm_is_one_line(armscan, tmp_path, text
     assert (code, errors) == (2, f"error: run {run_id}: its config.yaml is damaged")
     store_of(tmp_path).set_terminated(run_id, "KILLED")
     with pytest.raises(ResumeError, match="the run's configuration is damaged"):
-        resume([f"resume={run_id}"], list)
+        resume([f"resume={run_id}"])
 
 
 @pytest.mark.parametrize(
@@ -143,7 +143,7 @@ def test_run_with_a_class_of_ones_own_is_evaluated_with_trust(armscan, tmp_path)
 def test_grid_whose_command_line_names_code_is_not_resumed(tmp_path, word):
     run_id = grid_in(tmp_path, [word, "seed=1,2"])
     with pytest.raises(UntrustedError, match=re.escape(f"run {run_id}: its command line has {word!r}")):
-        resume([f"resume={run_id}"], list)
+        resume([f"resume={run_id}"])
 
 
 def test_grid_of_another_folder_is_not_resumed(tmp_path, monkeypatch):
@@ -151,10 +151,8 @@ def test_grid_of_another_folder_is_not_resumed(tmp_path, monkeypatch):
     (tmp_path / "mine").mkdir()
     monkeypatch.chdir(tmp_path / "mine")
     with pytest.raises(UntrustedError, match=f"run {run_id}: it was started in {tmp_path}, whose configuration could"):
-        resume([f"resume={run_id}"], list)
-    repeated = []
-    resume([f"resume={run_id}", "--trust"], lambda *words, **trust: repeated.extend((*words, trust)))
-    assert repeated == [["seed=1,2"], run_id, {"trust": True}]
+        resume([f"resume={run_id}"])
+    assert resume([f"resume={run_id}", "--trust"]) == (["seed=1,2"], run_id, True)
 
 
 @pytest.fixture
@@ -192,7 +190,7 @@ def test_server_that_a_run_names_for_its_artifacts_is_sent_nothing(armscan, tmp_
         assert (code, f"the artifacts are in {uri}" in errors) == (2, True)
     assert "they cannot be read" in armscan("runs", "show", run_id)[1]
     with pytest.raises(UntrustedError, match="the artifacts are in"):
-        resume([f"resume={run_id}"], list)
+        resume([f"resume={run_id}"])
     outbox = Outbox.begin(tmp_path / "theirs", Address(run_id, f"sqlite:///{tmp_path}/mlruns.db"))
     (tmp_path / "theirs/x.txt").touch()
     outbox.add(file=["x.txt", None])

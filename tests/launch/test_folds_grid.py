@@ -10,12 +10,11 @@ from hydra.errors import HydraException
 
 from armscan.config.error_messages import one_line_message
 from armscan.errors import InvalidValueError, VolumeError
-from armscan.experiment.console import jobs_table
-from armscan.experiment.job import JobOutcome
+from armscan.experiment.job import Grid, JobOutcome
 from armscan.launch.folds_grid import with_folds
 from armscan.launch.folds_table import AGENT, folds_table
 from armscan.launch.grid_plan import print_grid_plan
-from armscan.launch.grid_tables import keep_folds_table, keep_tables
+from armscan.launch.grid_tables import jobs_table, keep_folds_table, keep_tables
 from armscan.tracking.tags import DESCRIPTION_TAG
 from armscan.training import TEST, Evaluation, MetricEstimates
 from armscan.utils.run_files import RESULTS_PAGE
@@ -208,13 +207,9 @@ def test_folds_of_different_tasks_have_no_best(tmp_path, database, capsys, key, 
         outcomes[str(number)] = JobOutcome(words, words, metrics={})
         of_run = {"tags": {"job": str(number), "folder": str(folder)}, "params": {key: value, "data.fold": fold}}
         runs.append(SimpleNamespace(data=SimpleNamespace(**of_run)))
-    parent = {
-        "overrides": ["data.fold=0,1", f"{key}={','.join(values)}"],
-        "common": [],
-        "run_id": run_id,
-        "has_known_jobs": True,
-    }
-    keep_tables(jobs_table(outcomes, {}, have_same_task=False), tmp_path, parent, outcomes, runs, store)
+    overrides = ["data.fold=0,1", f"{key}={','.join(values)}"]
+    grid = Grid(run_id=run_id, tracking={}, overrides=overrides, shared=[])
+    keep_tables(jobs_table(outcomes, {}, have_same_task=False), tmp_path, grid, outcomes, runs, store)
     said = capsys.readouterr()
     assert said.err == ""
     assert ("best of 2" in said.out) == (key == "agent")
@@ -225,8 +220,8 @@ def test_page_of_an_interrupted_grid_counts_the_jobs_that_were_planned(tmp_path,
     store, experiment_id = store_in(tmp_path, "a")
     run_id = store.create_run(experiment_id, name="grid", tags={}).info.run_id
     outcomes = {"0": JobOutcome("", f"{key}=0", metrics={}), "1": JobOutcome("", f"{key}=1", failure="interrupted")}
-    parent = {"overrides": [f"{key}=0,1,2,3"], "common": [], "run_id": run_id, "has_known_jobs": True}
-    keep_tables(jobs_table(outcomes, {}, have_same_task=False), tmp_path, parent, outcomes, [], store)
+    grid = Grid(run_id=run_id, tracking={}, overrides=[f"{key}=0,1,2,3"], shared=[])
+    keep_tables(jobs_table(outcomes, {}, have_same_task=False), tmp_path, grid, outcomes, [], store)
     assert capsys.readouterr() == ("note: of 4 jobs, 3 without a result\n", "")
     page = (tmp_path / RESULTS_PAGE).read_text()
     assert "<h1>Grid of 4 jobs</h1>" in page

@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 from armscan import run
 from armscan.config.error_messages import one_line_message
 from armscan.errors import ArmscanError
-from armscan.experiment.job import INTERRUPTED, OUTCOME_FOLDER, PARENT_FILE, JobOutcome
+from armscan.experiment.job import INTERRUPTED, OUTCOME_FOLDER, Grid, JobOutcome
 from armscan.launch.grid_jobs import shared_overrides
 from armscan.launch.multirun import Multirun, end_grid
 from armscan.tracking import begin_outbox, sync
@@ -31,8 +31,7 @@ def test_address_of_the_store_is_read_again_as_it_was(uri):
 
 
 def test_second_interrupt_leaves_the_command_that_resumes_the_grid(tmp_path, monkeypatch, capsys):
-    parent = {"run_id": "a" * 32, "tracking": {"uri": "sqlite:///mine.db"}, "trust": False}
-    (tmp_path / PARENT_FILE).write_text(json.dumps(parent))
+    Grid(run_id="a" * 32, tracking={"uri": "sqlite:///mine.db"}, overrides=[], shared=[]).write(tmp_path)
     monkeypatch.setattr(Multirun, "folder", tmp_path)
     monkeypatch.setattr(run, "end_grid", Mock(side_effect=KeyboardInterrupt))
     run._end_interrupted()
@@ -61,10 +60,7 @@ def test_job_that_was_stopped_alone_has_not_failed(tmp_path, database, monkeypat
     store, experiment_id = store_in(tmp_path, "a")
     parent = store.create_run(experiment_id, name="multirun", tags={}).info.run_id
     tracking = {"uri": store.uri, "experiment": "a", "artifacts": str(tmp_path / "artifacts"), "wait_s": 60.0}
-    of_grid = {"run_id": parent, "tracking": tracking, "overrides": ["seed=0,1"], "common": [], "repeats": None}
-    (tmp_path / PARENT_FILE).write_text(
-        json.dumps(of_grid | {"is_trusted": True, "trust": False, "has_known_jobs": True})
-    )
+    Grid(run_id=parent, tracking=tracking, overrides=["seed=0,1"], shared=[]).write(tmp_path)
     (tmp_path / OUTCOME_FOLDER).mkdir()
     jobs = []
     for number, failure in enumerate((INTERRUPTED, None, None)):

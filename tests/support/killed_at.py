@@ -100,7 +100,7 @@ def commands(folder: Path) -> Iterator[Commands]:
 def _answer_orders() -> None:
     from armscan.run import main
 
-    for module in ("armscan.experiment.resume", "armscan.launch.multirun", "armscan.training.video"):
+    for module in ("armscan.launch.resume", "armscan.launch.multirun", "armscan.training.video"):
         importlib.import_module(module)
     for line in sys.stdin:
         order = json.loads(line)
