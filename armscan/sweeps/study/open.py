@@ -172,33 +172,19 @@ def _final_phases(search: Phase, settings: StudySettings, task: Task, final: Fin
         seeds_of=lambda trial: (training_of(trial)[1],),
         population=None,
     )
-    storage = search.scheduler.storage
+    scheduler = partial(TrialScheduler, storage=search.scheduler.storage, limits=limits, is_current=final.is_current)
     name_objectives(final.selection, search.objectives)
     name_objectives(final.judgement, [task.final_metric])
     return (
         shared(
             name=final.selection.study_name,
-            scheduler=TrialScheduler(
-                final.selection,
-                storage,
-                limits,
-                final.missing_of_selection,
-                is_current=final.is_current,
-                unwanted=final.unwanted_of_selection,
-            ),
+            scheduler=scheduler(final.selection, plan=final.missing_of_selection, unwanted=final.unwanted_of_selection),
             run=task.validate,
             folder=search.folder / "selection",
         ),
         shared(
             name=final.judgement.study_name,
-            scheduler=TrialScheduler(
-                final.judgement,
-                storage,
-                limits,
-                final.missing_of_judgement,
-                is_current=final.is_current,
-                unwanted=final.unwanted_of_judgement,
-            ),
+            scheduler=scheduler(final.judgement, plan=final.missing_of_judgement, unwanted=final.unwanted_of_judgement),
             objectives=(task.final_metric,),
             run=task.evaluate,
             folder=search.folder / "judged",
