@@ -10,10 +10,13 @@ from importlib import import_module
 
 import nbformat
 import pytest
+from click import ClickException
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
 from nbclient import NotebookClient
 
 from armscan.cli.main import armscan as program
+from armscan.errors import ArmscanError
 from tests.support import REPOSITORY
 
 DOCS = REPOSITORY / "docs"
@@ -99,33 +102,44 @@ def in_a_folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-@pytest.mark.full
-@pytest.mark.parametrize(("page", "words"), COMMANDS)
-def test_commands_of_pages_are_valid(page, words, in_a_folder):
+def mistake_in(words):
+    """Return the error of a command's options, or of the configuration that it composes; None if both are valid."""
     from armscan.config.compose import compose
     from armscan.experiment.build import check_config
 
+    try:
+        if words[0] != "run":
+            path = words[: 1 + (words[0] in ("runs", "data", "policy"))]
+            command = program
+            for name in path:
+                command = command.commands[name]
+            command.make_context(" ".join(path), words[len(path) :])
+        elif not any(word.startswith("resume=") for word in words):
+            check_config(compose(list(of_each_sweep([word for word in words[1:] if word not in OF_HYDRA]))))
+    except (ArmscanError, ClickException, HydraException) as error:
+        return str(error)
+    return None
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(("page", "words"), COMMANDS)
+def test_commands_of_pages_are_valid(page, words, in_a_folder):
     write_files(page, in_a_folder)
-    words = [filled_in(word) for word in words]
-    if words[0] != "run":
-        path = words[: 1 + (words[0] in ("runs", "data", "policy"))]
-        command = program
-        for name in path:
-            command = command.commands[name]
-        command.make_context(" ".join(path), words[len(path) :])
-    elif not any(word.startswith("resume=") for word in words):
-        check_config(compose(list(of_each_sweep([word for word in words[1:] if word not in OF_HYDRA]))))
+    assert mistake_in([filled_in(word) for word in words]) is None
 
 
 @pytest.mark.full
 def test_study_of_the_page_on_docker_is_valid():
-    from armscan.config.compose import compose
-    from armscan.experiment.build import check_config
+    pattern = r"^ARMSCAN_SWEEP=(.*)\n(?:.*\n)*?ARMSCAN_WORDS=(.*)"
+    sweep, words = re.search(pattern, (DOCS / "docker.md").read_text(), re.M).groups()
+    assert mistake_in(["run", f"sweep={sweep}", *shlex.split(words)]) is None
 
-    sweep, words = re.search(
-        r"^ARMSCAN_SWEEP=(.*)\n(?:.*\n)*?ARMSCAN_WORDS=(.*)", (DOCS / "docker.md").read_text(), re.M
-    ).groups()
-    check_config(compose([f"sweep={sweep}", *shlex.split(words)]))
+
+@pytest.mark.full
+def test_mistake_in_a_command_is_found():
+    assert "No such option" in mistake_in(["runs", "list", "--nowhere"])
+    assert "agent.nowhere" in mistake_in(["run", "agent.nowhere=1"])
+    assert "data.n_training" in mistake_in(["run", "experiment=best_full", "data=nifti", "data.path=."])
 
 
 def write_files(page, folder):

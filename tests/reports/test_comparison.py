@@ -225,20 +225,20 @@ def test_curve_of_some_seeds_alone_is_told(written, make_training):
     assert "the curve of steps" not in page
 
 
-def test_runs_of_a_group_that_ran_other_code_are_told(written, make_training):
-    page, _ = written(*(make_training(seed, commit=commit) for seed, commit in enumerate(("0123456789", "abcdef0123"))))
-    assert "Group 1: its runs used different versions of armscan: 01234567, abcdef01." in page
-    assert "differ by nothing but the seed, except for armscan's version." in page
-    page, _ = written(make_training(0, commit="0123456789"), make_training(1, commit=None))
-    assert "versions of armscan" not in page
-
-
-def test_runs_of_a_group_whose_own_classes_had_other_code_are_told(written, make_training):
-    page, _ = written(*(make_training(seed, own_code=code) for seed, code in enumerate(("parts:01", "parts:02"))))
-    assert "Group 1: its runs used different versions of parts (tag own_code)." in page
-    assert "differ by nothing but the seed, except for the code of own classes." in page
-    page, _ = written(make_training(0, own_code="parts:01"), make_training(1, own_code=None))
-    assert "(tag own_code)" not in page
+@pytest.mark.parametrize(
+    ("key", "values", "versions", "differs"),
+    [
+        ("commit", ("0123456789", "abcdef0123"), "versions of armscan: 01234567, abcdef01.", "armscan's version"),
+        ("own_code", ("parts:01", "parts:02"), "versions of parts (tag own_code).", "the code of own classes"),
+    ],
+    ids=["armscan", "own classes"],
+)
+def test_runs_of_a_group_that_ran_other_code_are_told(written, make_training, key, values, versions, differs):
+    page, _ = written(*(make_training(seed, **{key: value}) for seed, value in enumerate(values)))
+    assert f"Group 1: its runs used different {versions}" in page
+    assert f"differ by nothing but the seed, except for {differs}." in page
+    page, _ = written(make_training(0, **{key: values[0]}), make_training(1, **{key: None}))
+    assert "used different versions" not in page
 
 
 def test_pairs_that_chance_alone_sets_in_bold_are_counted(written, make_training):
