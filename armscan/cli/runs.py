@@ -195,10 +195,10 @@ def sync(folder: Path, tracking: str | None, trust: bool) -> int:
     """
     from armscan.tracking import open_existing_store
     from armscan.tracking import sync as upload_left
-    from armscan.tracking.notes import notes
+    from armscan.tracking.pending import pending_runs
     from armscan.tracking.store import absolute
 
-    own = {absolute(default_tracking()["uri"]), *(note.uri for note in notes().values())}
+    own = {absolute(default_tracking()["uri"]), *(each.uri for each in pending_runs().values())}
 
     def opened(tracked_in: str) -> TrackingStore:
         if tracking is None and not trust:

@@ -32,7 +32,7 @@ from armscan.experiment.job import (
 )
 from armscan.launch.grid_jobs import shared_overrides
 from armscan.launch.launchers import LAUNCHER, ON_THIS_MACHINE, check_launcher, prepare_launcher
-from armscan.tracking import TrackingSettings, TrackingStore, begin_outbox, code_state, note_end, open_store, sync
+from armscan.tracking import TrackingSettings, TrackingStore, begin_outbox, code_state, open_store, record_end, sync
 from armscan.tracking.sync import PROCESS_DIED
 from armscan.tracking.tags import (
     CONTINUED_TAG,
@@ -230,7 +230,7 @@ def _close_parent(
     tags = {f"failure.{number}": f"{each.varied}: {each.failure}" for number, each in failed.items()}
     if Multirun.outbox is not None:
         Multirun.outbox.close()
-    note_end(folder, grid.run_id, grid.uri, status, tags)
+    record_end(folder, grid.run_id, grid.uri, status, tags)
     store, experiment_id = open_store(**grid.tracking, retry_s=grid.tracking["wait_s"])
     # Uploads what the jobs could not while the store was unavailable.
     sync(folder, lambda _: store)

@@ -14,7 +14,7 @@ from armscan.config.trust import TRUST, check_stored_overrides
 from armscan.errors import InvalidValueError, ResumeError, UntrustedError
 from armscan.experiment.resume import check_unfinished, enter_working_folder, resume_run, tag_of
 from armscan.tracking import check_run_id, find_run, open_existing_store
-from armscan.tracking.notes import Note
+from armscan.tracking.pending import PendingRun
 from armscan.tracking.tags import GRID_TAG, WORKING_FOLDER_TAG
 from armscan.utils.files import SQLITE_PREFIX, sqlite_file
 
@@ -83,7 +83,7 @@ def _read(overrides: Sequence[str]) -> tuple[str, str]:
 
 def _check_ended(run: Run) -> None:
     """Raise `ResumeError` if a grid's launcher is alive on this machine: its jobs would be taken from it."""
-    launcher = note.process if (note := Note.of(run.info.run_id)) is not None else None
+    launcher = pending.process if (pending := PendingRun.of(run.info.run_id)) is not None else None
     if run.info.status == "RUNNING" and launcher is not None and launcher.is_here and launcher.is_alive:
         raise ResumeError(
             f"run {run.info.run_id} is still running, in process {launcher.pid}: wait until it ends, or interrupt it"

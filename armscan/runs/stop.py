@@ -12,7 +12,7 @@ from pathlib import Path
 from mlflow.entities import Run
 
 from armscan.errors import TrackingError
-from armscan.tracking.notes import Note
+from armscan.tracking.pending import PendingRun
 from armscan.tracking.tags import PARENT_TAG, STORAGE_TAG, STUDY_TAG, TRIAL_TAG
 
 
@@ -56,19 +56,19 @@ def interrupt(run: Run) -> str:
     Raises:
         TrackingError: If it is not running on this machine.
     """
-    run_id, note = run.info.run_id, Note.of(run.info.run_id)
+    run_id, pending = run.info.run_id, PendingRun.of(run.info.run_id)
     if run.info.status != "RUNNING":
         raise TrackingError(f"run {run_id} has ended already ({run.info.status})")
     unknown = TrackingError(f"run {run_id} belongs to no study, and this machine knows no process of it")
-    if note is None or not note.process.is_here or not note.process.is_alive:
+    if pending is None or not pending.process.is_here or not pending.process.is_alive:
         raise unknown
     try:
         # Runs and evaluations treat both alike.
-        os.kill(note.process.pid, signal.SIGTERM if _ignores_sigint(note.process.pid) else signal.SIGINT)
+        os.kill(pending.process.pid, signal.SIGTERM if _ignores_sigint(pending.process.pid) else signal.SIGINT)
     # It has ended since.
     except ProcessLookupError as error:
         raise unknown from error
-    return f"run {run_id}: its process {note.process.pid} was interrupted, and ends as with Ctrl-C"
+    return f"run {run_id}: its process {pending.process.pid} was interrupted, and ends as with Ctrl-C"
 
 
 def _ignores_sigint(pid: int) -> bool:

@@ -17,7 +17,7 @@ from armscan.tracking.run import TrackedRun
 from armscan.tracking.sanitize import flatten, tags_of
 from armscan.tracking.settings import TrackingSettings
 from armscan.tracking.store import check_artifacts, open_existing_store, open_store
-from armscan.tracking.sync import begin_outbox, fail_dead_runs, note_end, sync, upload_pending
+from armscan.tracking.sync import begin_outbox, fail_dead_runs, record_end, sync, upload_pending
 from armscan.tracking.tracking_store import TrackingStore
 
 __all__ = [
@@ -38,9 +38,9 @@ __all__ = [
     "flatten",
     "load_agent_run",
     "load_run",
-    "note_end",
     "open_existing_store",
     "open_store",
+    "record_end",
     "run_of_study",
     "sync",
     "tags_of",

@@ -22,7 +22,7 @@ from typing import Any, Literal, Self
 from filelock import FileLock, Timeout
 
 from armscan.errors import FolderInUseError, TrackingError
-from armscan.tracking.notes import NOTES_FOLDER, Note, forget
+from armscan.tracking.pending import PENDING_FOLDER, PendingRun, forget
 from armscan.utils.files import atomic_write, cache_folder, named_if_full, truncate_torn_line
 from armscan.utils.processes import ProcessInfo
 from armscan.utils.run_files import OUTBOX_FOLDER, OUTBOX_SUFFIXES
@@ -211,18 +211,18 @@ class Outbox(OutboxFile):
         self._uploaded[channel] = end
         atomic_write(self._uploaded_file, json.dumps(self._uploaded))
 
-    def note(self, uri: str) -> None:
-        """Write this machine's note of the run, so that the next start uploads what is left.
+    def mark_pending(self, uri: str) -> None:
+        """Add the run to this machine's pending runs, so that the next start uploads what is left.
 
         Args:
             uri: Address of the store that this process opened; an untrusted outbox may name another.
         """
-        # Nothing is lost without the note: `armscan runs sync` finds the outbox.
+        # Nothing is lost without the record: `armscan runs sync` finds the outbox.
         with contextlib.suppress(OSError):
-            folder = cache_folder() / NOTES_FOLDER
+            folder = cache_folder() / PENDING_FOLDER
             folder.mkdir(parents=True, exist_ok=True)
             forget(self.address.run_id)
-            Note(self.file.absolute(), uri, ProcessInfo.current()).write(folder / self.address.run_id)
+            PendingRun(self.file.absolute(), uri, ProcessInfo.current()).write(folder / self.address.run_id)
 
     def close(self) -> None:
         """Close and unlock the outbox."""

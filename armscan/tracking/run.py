@@ -13,8 +13,8 @@ from armscan.config.command_hints import armscan_command
 from armscan.errors import TrackingError, is_interruption
 from armscan.tracking.environment import environment_tags
 from armscan.tracking.git import DIFF_SUM, code_state
-from armscan.tracking.notes import forget
 from armscan.tracking.outbox import Address, Outbox, file_of, now_ms
+from armscan.tracking.pending import forget
 from armscan.tracking.sanitize import params_of, tags_of
 from armscan.tracking.system_metrics import PREFIX, SystemMetrics
 from armscan.tracking.tags import FAILURE_TAG, PARENT_TAG, PRUNED_TAG, RESUMED_TAG
@@ -56,7 +56,7 @@ class TrackedRun:
         self, store: TrackingStore, outbox: Outbox, *, name: str, logged: Collection[tuple[str, int]] = ()
     ) -> None:
         self._store, self._outbox = store, outbox
-        outbox.note(store.uri)
+        outbox.mark_pending(store.uri)
         self._uploader = Uploader(outbox, store)
         self._logged = frozenset(logged)
         self._is_closed, self._is_uploaded, self._is_resumed = False, False, False

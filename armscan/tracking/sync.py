@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 from armscan.config.trust import TRUST
 from armscan.errors import FolderInUseError, TrackingError, UntrustedError
-from armscan.tracking.notes import Note, forget, notes
 from armscan.tracking.outbox import CHANNELS, Address, Outbox, now_ms, outbox_files
+from armscan.tracking.pending import PendingRun, forget, pending_runs
 from armscan.tracking.run import SHORT_WAIT_S, TrackedRun
 from armscan.tracking.sanitize import tags_of
 from armscan.tracking.store import absolute
@@ -65,7 +65,7 @@ def sync(folder: Path, opened: Callable[[str], TrackingStore], *, trust: bool = 
     place = folder.resolve()
     removed = [
         each.outbox
-        for each in notes().values()
+        for each in pending_runs().values()
         if each.outbox.resolve().is_relative_to(place) and not each.outbox.exists()
     ]
     return _synced([*outbox_files(folder), *removed], opened, trust=trust)
@@ -79,7 +79,7 @@ def _synced(files: Iterable[Path], opened: Callable[[str], TrackingStore], *, tr
         try:
             with contextlib.closing(Outbox(file, timeout_s=0.0)) as outbox:
                 run_id, uri = outbox.address.run_id, outbox.address.uri
-                is_dead = (note := _note_of(file)) is not None and note.is_dead
+                is_dead = (pending := _pending_of(file)) is not None and pending.is_dead
                 is_open = is_dead and outbox.status not in ENDED and not _is_tracked_beside(file)
                 if outbox.is_uploaded and not is_open:
                     continue
@@ -89,8 +89,12 @@ def _synced(files: Iterable[Path], opened: Callable[[str], TrackingStore], *, tr
                     uploads.append(_upload_of(outbox, store, is_open=is_open, trust=trust))
                 stores[uri] = store
         except FileNotFoundError:
-            note = _note_of(file)
-            if note is not None and note.is_dead and (left := _end_removed(file.stem, note, opened)) is not None:
+            pending = _pending_of(file)
+            if (
+                pending is not None
+                and pending.is_dead
+                and (left := _end_removed(file.stem, pending, opened)) is not None
+            ):
                 uploads.append(Upload(file.parent.parent, file.stem, 0, left))
         except FolderInUseError:
             uploads.append(Upload(file.parent.parent, None, 0, IN_USE))
@@ -99,10 +103,10 @@ def _synced(files: Iterable[Path], opened: Callable[[str], TrackingStore], *, tr
     return uploads
 
 
-def _note_of(file: Path) -> Note | None:
-    """Return this machine's note of the run with this outbox; None if there is none, or it is of another outbox."""
-    note = Note.of(file.stem)
-    return note if note is not None and note.outbox.resolve() == file.resolve() else None
+def _pending_of(file: Path) -> PendingRun | None:
+    """Return this machine's pending run with this outbox; None if there is none, or it has another outbox."""
+    pending = PendingRun.of(file.stem)
+    return pending if pending is not None and pending.outbox.resolve() == file.resolve() else None
 
 
 def _is_tracked_beside(file: Path) -> bool:
@@ -119,10 +123,10 @@ def _is_tracked_beside(file: Path) -> bool:
     return False
 
 
-def _end_removed(run_id: str, note: Note, opened: Callable[[str], TrackingStore]) -> str | None:
+def _end_removed(run_id: str, pending: PendingRun, opened: Callable[[str], TrackingStore]) -> str | None:
     """Close a run as FAILED: its process died and its folder was removed; return why that is impossible, if it is."""
     try:
-        client = opened(note.uri).mlflow
+        client = opened(pending.uri).mlflow
         run = client.get_run(run_id)
         if run.info.status == "RUNNING" and run.info.lifecycle_stage == "active":
             client.set_tag(run_id, FAILURE_TAG, FOLDER_REMOVED)
@@ -178,7 +182,7 @@ def _end(outbox: Outbox, run: Run) -> None:
 def _check_own(outbox: Outbox, run: Run) -> None:
     """Raise `UntrustedError` unless the run was tracked from this folder, which could name any other."""
     folder, noted = outbox.folder.resolve(), run.data.tags.get(FOLDER_TAG)
-    if noted != str(folder) and _note_of(outbox.file) is None:
+    if noted != str(folder) and _pending_of(outbox.file) is None:
         raise UntrustedError(
             f"the run was not tracked from here on this machine, and its own folder is {noted or 'not known'}; if you "
             f"trust the author of {folder}, add {TRUST}"
@@ -199,17 +203,17 @@ def _upload_pending(store: TrackingStore) -> None:
         return store
 
     here = ProcessInfo.current()
-    for run_id, note in notes().items():
-        is_there = note.outbox.exists()
-        uploads = _synced([note.outbox], opened, trust=False)
+    for run_id, pending in pending_runs().items():
+        is_there = pending.outbox.exists()
+        uploads = _synced([pending.outbox], opened, trust=False)
         for each in uploads:
             if each.n_entries:
                 log(f"run {each.run_id}: uploaded {each.n_entries} entries that it had left")
-        # A run in progress keeps its note. So does one of another machine that shares this cache, as its folder may
-        # be local to that machine. A process of an earlier boot has ended; an earlier version noted no process.
-        process = note.process
+        # A run in progress stays pending. So does one of another machine that shares this cache, as its folder may
+        # be local to that machine. A process of an earlier boot has ended; an earlier version recorded no process.
+        process = pending.process
         has_ended = not process.host or (process.host == here.host and process.boot != here.boot)
-        is_over = (is_there or has_ended) and not _is_tracked_beside(note.outbox)
+        is_over = (is_there or has_ended) and not _is_tracked_beside(pending.outbox)
         if is_over and all(each.left is None for each in uploads):
             forget(run_id)
 
@@ -238,13 +242,13 @@ def fail_dead_runs(folder: Path, store: TrackingStore, reason: str) -> None:
 
 
 def begin_outbox(folder: Path, run_id: str, uri: str) -> Outbox:
-    """Open the outbox of a run, with this machine's note: if this process dies, a later one closes the run."""
+    """Open the outbox of a run, which is then pending here: if this process dies, a later one closes the run."""
     outbox = Outbox.begin(folder, Address(run_id, absolute(uri)))
-    outbox.note(absolute(uri))
+    outbox.mark_pending(absolute(uri))
     return outbox
 
 
-def note_end(folder: Path, run_id: str, uri: str, status: str, tags: Mapping[str, str]) -> None:
+def record_end(folder: Path, run_id: str, uri: str, status: str, tags: Mapping[str, str]) -> None:
     """Record a run's end in its outbox, for `sync` to upload, without contacting the store.
 
     Args:

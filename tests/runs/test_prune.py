@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from armscan.tracking.notes import NOTES_FOLDER
 from armscan.tracking.outbox import file_of
+from armscan.tracking.pending import PENDING_FOLDER
 from armscan.utils.run_files import LOCK_FILE
 
 
@@ -319,7 +319,7 @@ def test_note_of_a_run_goes_with_its_folder(answer, make_run, monkeypatch, tmp_p
     monkeypatch.setenv("ARMSCAN_CACHE", str(tmp_path / "cache"))
     run_id = make_run()
     # As left by a run whose rest was uploaded by `armscan runs sync`.
-    note = tmp_path / "cache" / NOTES_FOLDER / run_id
-    note.symlink_to(file_of(tmp_path / "outputs" / "tiny", run_id))
+    pending = tmp_path / "cache" / PENDING_FOLDER / run_id
+    pending.symlink_to(file_of(tmp_path / "outputs" / "tiny", run_id))
     assert answer("prune", "folders", "--apply")[0] == 0
-    assert not note.exists()
+    assert not pending.exists()

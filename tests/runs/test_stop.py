@@ -30,7 +30,7 @@ def test_run_is_interrupted_even_if_it_ignores_ctrl_c(monkeypatch, handler):
     with process:
         assert process.stdout.readline() == b"ready\n"
         note = SimpleNamespace(process=SimpleNamespace(pid=process.pid, is_here=True, is_alive=True))
-        monkeypatch.setattr(stop.Note, "of", lambda _: note)
+        monkeypatch.setattr(stop.PendingRun, "of", lambda _: note)
         run = SimpleNamespace(info=SimpleNamespace(run_id="a", status="RUNNING"))
         assert f"its process {process.pid} was interrupted" in stop.interrupt(run)
         assert process.wait(60) == 130

@@ -12,8 +12,8 @@ import pytest
 from mlflow import MlflowClient
 
 from armscan.tracking import TrackedRun, open_existing_store, open_store, sync
-from armscan.tracking.notes import NOTES_FOLDER, notes
 from armscan.tracking.outbox import Outbox, file_of, now_ms
+from armscan.tracking.pending import PENDING_FOLDER, pending_runs
 from armscan.tracking.sync import FOLDER_REMOVED, PROCESS_DIED, _upload_pending
 from armscan.utils.processes import ProcessInfo
 from tests.support.waiting import HANG_S
@@ -49,7 +49,7 @@ def run_id(uri, tmp_path):
     assert receiver.poll(HANG_S)
     run_id = receiver.recv()
     process.join()
-    assert notes().keys() == {run_id}
+    assert pending_runs().keys() == {run_id}
     assert ending_of(uri, run_id) == ("RUNNING", None)
     return run_id
 
@@ -66,7 +66,7 @@ def test_run_that_was_killed_is_ended_by_the_next_process(uri, run_id, tmp_path,
         shutil.rmtree(tmp_path / "run")
     if who == "a start":
         _upload_pending(open_existing_store(uri))
-        assert notes() == {}
+        assert pending_runs() == {}
     else:
         assert not any(upload.left for upload in sync(tmp_path, open_existing_store))
     assert ending_of(uri, run_id) == ("FAILED", FOLDER_REMOVED if is_removed else PROCESS_DIED)
@@ -115,9 +115,9 @@ def test_end_before_the_run_was_resumed_is_not_its_end(uri, run_id, tmp_path):
     "changed", [{"host": "elsewhere"}, {"boot": "another"}, {"pid_namespace": "another"}, asdict(ProcessInfo.current())]
 )
 def test_run_of_another_machine_or_of_a_living_process_is_not_ended(uri, run_id, tmp_path, changed, is_removed):
-    file = tmp_path / "cache" / NOTES_FOLDER / run_id
-    note = json.loads(file.read_text())
-    file.write_text(json.dumps(note | {"process": note["process"] | changed}))
+    file = tmp_path / "cache" / PENDING_FOLDER / run_id
+    record = json.loads(file.read_text())
+    file.write_text(json.dumps(record | {"process": record["process"] | changed}))
     if is_removed:
         shutil.rmtree(tmp_path / "run")
     sync(tmp_path, open_existing_store)

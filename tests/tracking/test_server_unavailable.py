@@ -14,9 +14,9 @@ from mlflow import MlflowClient
 
 from armscan.cli.main import main
 from armscan.errors import TrackingError, TrackingUnavailableError
-from armscan.tracking import TrackedRun, fail_dead_runs, note_end, open_store, sync, upload_pending, uploader
-from armscan.tracking.notes import notes
+from armscan.tracking import TrackedRun, fail_dead_runs, open_store, record_end, sync, upload_pending, uploader
 from armscan.tracking.outbox import file_of
+from armscan.tracking.pending import pending_runs
 from armscan.tracking.tracking_store import reason_in, unavailable_reason
 from armscan.utils.files import cache_folder
 from tests.support.disks import small_disk
@@ -62,19 +62,19 @@ def test_what_a_run_could_not_upload_the_next_start_uploads(server, opened, tmp_
     assert removed._uploader.finish(HANG_S) is None
     removed._outbox.close()
     shutil.rmtree(gone)
-    assert {tracked.run_id, going_on.run_id, removed.run_id} <= notes().keys()
-    # A note that was only partly written does no harm.
+    assert {tracked.run_id, going_on.run_id, removed.run_id} <= pending_runs().keys()
+    # A record that was only partly written does no harm.
     (cache_folder() / "undelivered" / "0").write_bytes(b"\0")
     # In the package's namespace, `sync` is the function.
     monkeypatch.setattr(sys.modules["armscan.tracking.sync"], "_looked_for", set())
     for _ in range(2):
         upload_pending(opened[0])
-    wait_until(lambda: tracked.run_id not in notes())
+    wait_until(lambda: tracked.run_id not in pending_runs())
     assert histories(server.uri, tracked.run_id) == {"x": [(7, 1.0)]}
     assert MlflowClient(server.uri).get_run(tracked.run_id).info.status == "FINISHED"
     assert f"run {tracked.run_id}: " in capfd.readouterr().out.splitlines()[-1]
     assert going_on.end("FINISHED")
-    assert not {tracked.run_id, going_on.run_id} & notes().keys()
+    assert not {tracked.run_id, going_on.run_id} & pending_runs().keys()
 
 
 def test_run_goes_on_while_the_server_is_unavailable_and_nothing_is_lost_or_there_twice(
@@ -307,7 +307,7 @@ def test_sync_goes_on_after_what_it_cannot_upload(opened, server, tmp_path, capf
 def test_end_of_a_run_is_noted_without_its_store(opened, server, tmp_path):
     store, experiment_id = opened
     run_id = store.create_run(experiment_id, name="parent", tags={}).info.run_id
-    note_end(tmp_path, run_id, server.uri, "FAILED", {"failure.0": "no luck"})
+    record_end(tmp_path, run_id, server.uri, "FAILED", {"failure.0": "no luck"})
     assert main(["runs", "sync", str(tmp_path)]) == 0
     run = MlflowClient(server.uri).get_run(run_id)
     assert (run.info.status, run.data.tags["failure.0"]) == ("FAILED", "no luck")

@@ -30,8 +30,8 @@ from armscan.tracking import (
     open_store,
     uploader,
 )
-from armscan.tracking.notes import NOTES_FOLDER, Note, notes
 from armscan.tracking.outbox import Address, Outbox, file_of
+from armscan.tracking.pending import PENDING_FOLDER, PendingRun, pending_runs
 from armscan.tracking.sanitize import flatten
 from armscan.tracking.sync import _upload_pending, sync
 from armscan.tracking.tags import DESCRIPTION_TAG, VERSION_TAG
@@ -217,12 +217,12 @@ def test_file_outside_of_a_strangers_folder_is_not_uploaded(store, tmp_path, kin
     assert client.list_artifacts(run_id) == []
     # Nor by a process that resumes the run.
     with contextlib.closing(Outbox.begin(folder, Address(run_id, client.uri))) as outbox:
-        outbox.note(client.uri)
+        outbox.mark_pending(client.uri)
         with pytest.raises(UntrustedError, match="add --trust"):
             upload(outbox, client.mlflow, "files")
     assert client.list_artifacts(run_id) == []
     # Nor by a later start, though this machine has noted that something is left.
-    assert run_id in notes()
+    assert run_id in pending_runs()
     _upload_pending(client)
     assert client.list_artifacts(run_id) == []
     (uploaded,) = sync(tmp_path, lambda _: client, trust=True)
@@ -233,16 +233,16 @@ def test_file_outside_of_a_strangers_folder_is_not_uploaded(store, tmp_path, kin
 @pytest.mark.parametrize(
     ("process", "is_kept"), [({"host": "elsewhere"}, True), ({"pid_namespace": "other"}, True), ({"boot": "1"}, False)]
 )
-def test_note_of_another_machine_stays_where_its_folder_cannot_be_seen(store, tmp_path, monkeypatch, process, is_kept):
+def test_pending_run_of_another_machine_stays_if_its_folder_is_not_here(store, tmp_path, monkeypatch, process, is_kept):
     monkeypatch.setenv("ARMSCAN_CACHE", str(tmp_path / "cache"))
     client, experiment_id = store
     run_id = client.create_run(experiment_id, name="n", tags={}).info.run_id
-    folder = tmp_path / "cache" / NOTES_FOLDER
+    folder = tmp_path / "cache" / PENDING_FOLDER
     folder.mkdir(parents=True)
     noted = dataclasses.replace(ProcessInfo.current(), **process)
-    Note(tmp_path / "local to a node" / "outbox", client.uri, noted).write(folder / run_id)
+    PendingRun(tmp_path / "local to a node" / "outbox", client.uri, noted).write(folder / run_id)
     _upload_pending(client)
-    assert (run_id in notes()) == is_kept
+    assert (run_id in pending_runs()) == is_kept
 
 
 @pytest.mark.parametrize("tags", [{}, {"folder": "/mine"}], ids=["a study's", "a training's"])

@@ -1,4 +1,4 @@
-"""This machine's notes of runs that may have entries to upload, or have not ended."""
+"""This machine's pending runs: they may have entries to upload, or have not ended."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from typing import Self
 from armscan.utils.files import atomic_write, cache_folder
 from armscan.utils.processes import ProcessInfo
 
-NOTES_FOLDER = "undelivered"
+PENDING_FOLDER = "undelivered"
 
 
 def forget(run_id: str) -> None:
-    """Remove the note of a run, once everything is uploaded or the run is deleted."""
+    """Remove a run from this machine's pending runs, once everything is uploaded or the run is deleted."""
     with contextlib.suppress(OSError):
-        (cache_folder() / NOTES_FOLDER / run_id).unlink(missing_ok=True)
+        (cache_folder() / PENDING_FOLDER / run_id).unlink(missing_ok=True)
 
 
 @dataclass(frozen=True)
-class Note:
-    """This machine's note of a run that may have entries to upload, or may not have ended.
+class PendingRun:
+    """A run on this machine that may have entries to upload, or may not have ended.
 
     Args:
         outbox: File of the run's outbox.
@@ -36,8 +36,8 @@ class Note:
 
     @classmethod
     def of(cls, run_id: str) -> Self | None:
-        """Return the note of a run, None if there is none; an earlier version's note is a link to the outbox."""
-        file = cache_folder() / NOTES_FOLDER / run_id
+        """Return a run if it is pending here, else None; earlier versions wrote a link to the outbox."""
+        file = cache_folder() / PENDING_FOLDER / run_id
         try:
             if file.is_symlink():
                 return cls(file.readlink(), "", ProcessInfo.of({}))
@@ -47,7 +47,7 @@ class Note:
             return None
 
     def write(self, file: Path) -> None:
-        """Write the note to a file."""
+        """Write the record to a file."""
         told = {"outbox": str(self.outbox), "uri": self.uri, "process": asdict(self.process)}
         atomic_write(file, json.dumps(told))
 
@@ -57,7 +57,7 @@ class Note:
         return self.process.is_here and not self.process.is_alive
 
 
-def notes() -> dict[str, Note]:
-    """Return this machine's notes by run ID."""
-    names = sorted(file.name for file in (cache_folder() / NOTES_FOLDER).glob("*"))
-    return {name: note for name in names if (note := Note.of(name)) is not None}
+def pending_runs() -> dict[str, PendingRun]:
+    """Return this machine's pending runs by run ID."""
+    names = sorted(file.name for file in (cache_folder() / PENDING_FOLDER).glob("*"))
+    return {name: pending for name in names if (pending := PendingRun.of(name)) is not None}
