@@ -90,12 +90,9 @@ def _synced(files: Iterable[Path], opened: Callable[[str], TrackingStore], *, tr
                 stores[uri] = store
         except FileNotFoundError:
             pending = _pending_of(file)
-            if (
-                pending is not None
-                and pending.is_dead
-                and (left := _end_removed(file.stem, pending, opened)) is not None
-            ):
-                uploads.append(Upload(file.parent.parent, file.stem, 0, left))
+            if pending is not None and pending.is_dead:
+                left = _end_removed(file.stem, pending, opened)
+                uploads += [Upload(file.parent.parent, file.stem, 0, left)] if left is not None else []
         except FolderInUseError:
             uploads.append(Upload(file.parent.parent, None, 0, IN_USE))
         except (OSError, TrackingError) as error:
