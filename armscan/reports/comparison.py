@@ -74,13 +74,13 @@ def write_comparison(groups: Sequence[Group], left_out: Sequence[TrackedTraining
     Returns:
         The HTML file.
     """
-    figures = _figures(groups)
+    metrics = _metrics(groups)
     curves = {
-        (figure, axis, number): curve
-        for figure in figures
+        (metric, axis, number): curve
+        for metric in metrics
         for axis in AXES
         for number, group in enumerate(groups)
-        if (curve := curve_of(group, figure, axis))
+        if (curve := curve_of(group, metric, axis))
     }
     reached = [final_metrics(group) for group in groups]
     pairs = compare_groups(groups)
@@ -88,7 +88,7 @@ def write_comparison(groups: Sequence[Group], left_out: Sequence[TrackedTraining
     labels = {group.label for group in groups}
     baselines = {name: each for name, each in final.results.items() if name not in labels}
     tables = all_numbers(groups, curves, reached, pairs, baselines)
-    titles = validation_titles(figures)
+    titles = validation_titles(metrics)
     has_other_volumes = any(each.probability is None for each in pairs["on_plane_rate"])
     parts = [
         f"<p><strong>{html.escape(final.headline)}</strong></p>" if final.headline else "",
@@ -98,14 +98,14 @@ def write_comparison(groups: Sequence[Group], left_out: Sequence[TrackedTraining
         *_final(groups, reached, replace(final, headline=""), baselines),
         *_better(groups, pairs),
         videos(groups),
-        *_of_the_training(groups, curves, [figure for figure in figures if figure not in titles]),
+        *_of_the_training(groups, curves, [metric for metric in metrics if metric not in titles]),
         "<h2>Runs</h2>",
         table(tables["runs"], what="runs"),
     ]
     return write_page(folder, title, parts, tables)
 
 
-def _figures(groups: Sequence[Group]) -> list[str]:
+def _metrics(groups: Sequence[Group]) -> list[str]:
     """Return the names of the metrics that can be drawn, those of the validation first."""
     names = {name for group in groups for training in group.trainings for name in training.series}
     titles = validation_titles(names)
@@ -143,7 +143,7 @@ def _seed_and_fold(training: TrackedTraining) -> str:
 
 def _learning(groups: Sequence[Group], curves: Curves) -> Iterator[str]:
     yield "<h2>Learning curves</h2>"
-    titles = validation_titles(figure for figure, *_ in curves)
+    titles = validation_titles(metric for metric, *_ in curves)
     if titles:
         is_detailed = len(groups) <= MAX_DETAILED
         how = HOW_CURVES if is_detailed else f"{HOW_CURVES} {MEANS_ALONE}"
@@ -152,9 +152,9 @@ def _learning(groups: Sequence[Group], curves: Curves) -> Iterator[str]:
         yield "<p>None of these runs has been validated: nothing is trained, or nothing validated yet.</p>"
 
 
-def _of_the_training(groups: Sequence[Group], curves: Curves, figures: Sequence[str]) -> Iterator[str]:
-    if figures:
-        titles = {name: _title_of_training(name) for name in figures}
+def _of_the_training(groups: Sequence[Group], curves: Curves, metrics: Sequence[str]) -> Iterator[str]:
+    if metrics:
+        titles = {name: _title_of_training(name) for name in metrics}
         drawn = chart(learning_curves(groups, curves, titles, is_detailed=len(groups) <= MANY))
         yield folded("Metrics of the training itself: losses, returns, speed", drawn)
 
@@ -180,14 +180,14 @@ def _final(
 def final_table(groups: Sequence[Group], reached: Sequence[MetricEstimates | None]) -> ResultTable:
     """Return the table of the groups' results, and of the baselines."""
     nothing = MetricEstimates.of_metrics({})
-    figures = {group.label: each or nothing for group, each in zip(groups, reached, strict=True)}
+    metrics = {group.label: each or nothing for group, each in zip(groups, reached, strict=True)}
     evaluated = [group for group in groups if evaluations_by_seed(group)]
     labels = [group.label for group in evaluated]
     baselines = dict(zip(labels, baseline_metrics(evaluated), strict=True))
     randoms = {label: each[RANDOM] for label, each in baselines.items() if RANDOM in each}
     # The best of several tasks is the easiest.
     is_one_task = have_same_volumes(evaluated) and not differing_rules(evaluated)
-    return ResultTable(with_baselines(figures, baselines), headline=headline(figures, randoms) if is_one_task else "")
+    return ResultTable(with_baselines(metrics, baselines), headline=headline(metrics, randoms) if is_one_task else "")
 
 
 def _better(groups: Sequence[Group], pairs: Mapping[str, Sequence[Pair]]) -> Iterator[str]:
@@ -198,15 +198,15 @@ def _better(groups: Sequence[Group], pairs: Mapping[str, Sequence[Pair]]) -> Ite
         yield "<p>Fewer than two groups have a final evaluation.</p>"
         return
     matrices = []
-    for figure, of_figure in pairs.items():
-        heading = f"By {'on-plane rate' if figure == 'on_plane_rate' else title_of(figure)}: "
-        heading += f"{'higher' if COMPARED_BY[figure] else 'lower'} is better"
-        matrices.append(f"<div><h3>{heading}</h3>{_matrix(groups, of_figure)}</div>")
+    for metric, of_metric in pairs.items():
+        heading = f"By {'on-plane rate' if metric == 'on_plane_rate' else title_of(metric)}: "
+        heading += f"{'higher' if COMPARED_BY[metric] else 'lower'} is better"
+        matrices.append(f"<div><h3>{heading}</h3>{_matrix(groups, of_metric)}</div>")
     n_seeds = [len(evaluations_by_seed(group)) for group in groups]
     # With very few seeds, pairs are never bold.
     n_pairs = max(
-        sum(each.probability is not None and can_differ(n_seeds[each.ours], n_seeds[each.theirs]) for each in of_figure)
-        for of_figure in pairs.values()
+        sum(each.probability is not None and can_differ(n_seeds[each.ours], n_seeds[each.theirs]) for each in of_metric)
+        for of_metric in pairs.values()
     )
     by_chance = (
         f" If all groups were alike, at most {0.05 * n_pairs:.2g} of {n_pairs} pairs would be bold by chance, on "

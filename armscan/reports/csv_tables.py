@@ -49,8 +49,8 @@ def _seed_and_fold(training: TrackedTraining) -> Row:
 
 
 def _curve_rows(groups: Sequence[Group], curves: Curves) -> Iterator[Row]:
-    for (figure, axis, number), curve in curves.items():
-        of_curve = {"group": groups[number].name, "figure": figure, "axis": axis, "seeds": curve.n_seeds}
+    for (metric, axis, number), curve in curves.items():
+        of_curve = {"group": groups[number].name, "metric": metric, "axis": axis, "seeds": curve.n_seeds}
         for place, value, low, high in zip(curve.places, *curve.band, strict=True):
             yield {**of_curve, "place": place, "value": value, "low": low, "high": high}
 
@@ -58,9 +58,9 @@ def _curve_rows(groups: Sequence[Group], curves: Curves) -> Iterator[Row]:
 def _seed_rows(groups: Sequence[Group]) -> Iterator[Row]:
     for group in groups:
         for training in group.trainings:
-            for figure, series in training.series.items():
+            for metric, series in training.series.items():
                 of_training = {"group": group.name, "run": training.run_id, **_seed_and_fold(training)}
-                of_series = {**of_training, "figure": figure}
+                of_series = {**of_training, "metric": metric}
                 for env_steps, wall_s, value in zip(series.env_steps, series.wall_s, series.values, strict=True):
                     yield {**of_series, "env_steps": int(env_steps), "wall_s": wall_s, "value": value}
 
@@ -69,24 +69,24 @@ def _final_rows(
     groups: Sequence[Group], reached: Sequence[MetricEstimates | None], baselines: Mapping[str, MetricEstimates]
 ) -> Iterator[Row]:
     names = (*(group.name for group in groups), *baselines)
-    for of, figures in zip(names, (*reached, *baselines.values()), strict=True):
-        if figures is None:
+    for of, metrics in zip(names, (*reached, *baselines.values()), strict=True):
+        if metrics is None:
             continue
-        for name in figures.estimates:
-            yield {"group": of, "seeds": figures.n_seeds, "figure": name, **figures.estimate(name)._asdict()}
+        for name in metrics.estimates:
+            yield {"group": of, "seeds": metrics.n_seeds, "metric": name, **metrics.estimate(name)._asdict()}
 
 
 def _volume_rows(groups: Sequence[Group]) -> Iterator[Row]:
     for group in groups:
         for training in group.trainings:
-            for volume, figures in metrics_by_volume(training).items():
+            for volume, metrics in metrics_by_volume(training).items():
                 of_training = {"group": group.name, "run": training.run_id, **_seed_and_fold(training)}
-                yield {**of_training, "volume": volume, **figures}
+                yield {**of_training, "volume": volume, **metrics}
 
 
 def _pair_rows(groups: Sequence[Group], pairs: Mapping[str, Sequence[Pair]]) -> Iterator[Row]:
-    for figure, of_figure in pairs.items():
-        for pair in of_figure:
+    for metric, of_metric in pairs.items():
+        for pair in of_metric:
             if pair.probability is not None:
                 names = {"better": groups[pair.ours].name, "than": groups[pair.theirs].name}
-                yield {"figure": figure, **names, **pair.probability._asdict()}
+                yield {"metric": metric, **names, **pair.probability._asdict()}

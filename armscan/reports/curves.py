@@ -43,7 +43,7 @@ NOTHING = Curve(np.empty(0), Band(*[np.empty(0)] * 3), 0, {})
 """Placeholder where no training has measured the metric over an axis."""
 
 
-def curve_of(group: Group, figure: str, axis: str) -> Curve | None:
+def curve_of(group: Group, metric: str, axis: str) -> Curve | None:
     """Return the curve of a group; None if none of its trainings has measured the metric.
 
     Values are interpolated linearly between validations. A training that has ended keeps its last value while others of
@@ -52,11 +52,11 @@ def curve_of(group: Group, figure: str, axis: str) -> Curve | None:
 
     Args:
         group: Group of the curve.
-        figure: Name of the metric.
+        metric: Name of the metric.
         axis: Name of the axis, a key of `AXES`.
     """
-    trainings = of_common_folds(training for training in group.trainings if figure in training.series)
-    lines = [_line(training.series[figure], axis) for training in trainings]
+    trainings = of_common_folds(training for training in group.trainings if metric in training.series)
+    lines = [_line(training.series[metric], axis) for training in trainings]
     known = [(training, line) for training, line in zip(trainings, lines, strict=True) if len(line[0])]
     if not known:
         return None
@@ -66,7 +66,7 @@ def curve_of(group: Group, figure: str, axis: str) -> Curve | None:
         of_seeds[training.seed_key].append(np.interp(places, *line))
     # The folds of a seed count as one seed.
     values, *ends = band_over_seeds(np.array([np.mean(each, axis=0) for each in of_seeds.values()]))
-    band = Band(values, *np.clip(ends, *bounds_of(figure)))
+    band = Band(values, *np.clip(ends, *bounds_of(metric)))
     return Curve(places, band, len(of_seeds), {training.label: line for training, line in known})
 
 

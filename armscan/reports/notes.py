@@ -115,12 +115,12 @@ def _on_missing(groups: Sequence[Group]) -> Iterator[str]:
 
 
 def _on_curves(groups: Sequence[Group], curves: Curves) -> Iterator[str]:
-    titles = validation_titles(figure for figure, *_ in curves)
-    n_of = {(figure, number): curve.n_seeds for (figure, _, number), curve in curves.items() if figure in titles}
-    for (figure, number), n_seeds in n_of.items():
+    titles = validation_titles(metric for metric, *_ in curves)
+    n_of = {(metric, number): curve.n_seeds for (metric, _, number), curve in curves.items() if metric in titles}
+    for (metric, number), n_seeds in n_of.items():
         if n_seeds < groups[number].n_seeds:
             yield (
-                f"Group {groups[number].number}: the curve of {titles[figure]} is over {n_seeds} of its "
+                f"Group {groups[number].number}: the curve of {titles[metric]} is over {n_seeds} of its "
                 f"{groups[number].n_seeds} seeds, because the others have not tracked it."
             )
 

@@ -66,11 +66,11 @@ def compare_groups(groups: Sequence[Group]) -> dict[str, list[Pair]]:
     pairs = list(combinations([number for number, of_group in enumerate(metrics) if of_group], 2))
     comparable = [pair for pair in pairs if _are_same(*(volumes[number] for number in pair))]
     compared = {}
-    for figure, is_higher_better in COMPARED_BY.items():
-        scores = [_scores(of_group, figure) * (1.0 if is_higher_better else -1.0) for of_group in metrics]
+    for metric, is_higher_better in COMPARED_BY.items():
+        scores = [_scores(of_group, metric) * (1.0 if is_higher_better else -1.0) for of_group in metrics]
         found = probabilities_of_improvement([(scores[ours], scores[theirs]) for ours, theirs in comparable])
         known = dict(zip(comparable, found, strict=True))
-        compared[figure] = [Pair(*pair, known.get(pair)) for pair in pairs]
+        compared[metric] = [Pair(*pair, known.get(pair)) for pair in pairs]
     return compared
 
 
@@ -119,10 +119,10 @@ def _baselines(group: Group) -> dict[str, list[Evaluation]]:
     return {name: [each[name] for each in of_fold.values() if name in each] for name in names}
 
 
-def _scores(trainings: Sequence[Mapping[str, Mapping[str, float]]], figure: str) -> FloatArray:
+def _scores(trainings: Sequence[Mapping[str, Mapping[str, float]]], metric: str) -> FloatArray:
     """Return a metric of trainings, shape (seeds, volumes), on the volumes that all of them share."""
     common = sorted(set.intersection(*map(set, trainings))) if trainings else []
-    return np.array([[training[volume][figure] for volume in common] for training in trainings])
+    return np.array([[training[volume][metric] for volume in common] for training in trainings])
 
 
 def _compared(evaluation: Evaluation) -> dict[str, dict[str, float]]:

@@ -174,16 +174,16 @@ class TrackedRun:
         if (every_s := self._store.system_metrics_s) is not None:
             looks = [step for name, step in self._logged if name.startswith(PREFIX)]
             self._system = SystemMetrics(
-                lambda figures, number: self.log_metrics(figures, n_env_steps=number),
+                lambda metrics, number: self.log_metrics(metrics, n_env_steps=number),
                 every_s=every_s,
                 first=max(looks, default=-1) + 1,
             )
 
     def on_epoch(self, report: EpochReport) -> None:
         """Log an epoch's metrics at its environment step."""
-        figures = {f"validation/{name}": value for name, value in report.evaluation.metrics().items()}
-        figures |= report.metrics | {"wall_s": report.wall_s}
-        self.log_metrics(figures, n_env_steps=report.n_env_steps)
+        metrics = {f"validation/{name}": value for name, value in report.evaluation.metrics().items()}
+        metrics |= report.metrics | {"wall_s": report.wall_s}
+        self.log_metrics(metrics, n_env_steps=report.n_env_steps)
 
     def on_end(self) -> None:
         """Stop monitoring the machine; evaluation and artifacts follow."""
@@ -191,18 +191,18 @@ class TrackedRun:
             self._system.finish()
             self._system = None
 
-    def log_metrics(self, figures: Mapping[str, float], *, n_env_steps: int, keeps_nan: bool = False) -> None:
+    def log_metrics(self, metrics: Mapping[str, float], *, n_env_steps: int, keeps_nan: bool = False) -> None:
         """Log metrics at an environment step, except NaN and those that an earlier process logged.
 
         Args:
-            figures: Metrics by name.
+            metrics: Metrics by name.
             n_env_steps: The environment step.
             keeps_nan: Whether to log NaN, too, in place of values that are not valid any more. Default: False.
         """
         at_ms = now_ms()
         points = [
             (name, float(value), at_ms, n_env_steps)
-            for name, value in figures.items()
+            for name, value in metrics.items()
             # NaN is the mean over no episodes.
             if (keeps_nan or value == value) and (name, n_env_steps) not in self._logged
         ]

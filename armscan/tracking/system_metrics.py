@@ -36,12 +36,12 @@ class SystemMetrics:
         monitors, is_over = _monitors(), False
         while not is_over:
             is_over = self._is_over.wait(self._every_s)
-            figures: dict[str, float] = {}
+            metrics: dict[str, float] = {}
             for monitor in monitors:
                 monitor.collect_metrics()
-                figures |= {f"{PREFIX}{name}": float(value) for name, value in monitor.aggregate_metrics().items()}
+                metrics |= {f"{PREFIX}{name}": float(value) for name, value in monitor.aggregate_metrics().items()}
                 monitor.clear_metrics()
-            self._take(figures, self._number)
+            self._take(metrics, self._number)
             self._number += 1
 
 

@@ -33,7 +33,7 @@ def test_twenty_groups_have_a_report(written, make_training):
     assert "40 runs in 20 groups" in page
     assert len(rows("improvement")) == 4 * 20 * 19 / 2
     assert page.count("data-video") == 20
-    steps = {row["group"]: float(row["value"]) for row in rows("final") if row["figure"] == "mean_steps"}
+    steps = {row["group"]: float(row["value"]) for row in rows("final") if row["metric"] == "mean_steps"}
     assert steps == {f"agent.lr={lr}": lr for lr in range(1, 21)}
 
 
@@ -59,14 +59,14 @@ def test_fewer_steps_are_better_and_equal_ones_are_no_difference(make_training):
     assert pairs[0, 2].low < 0.5 < pairs[0, 2].high
 
 
-@pytest.mark.parametrize("figure", ["on_plane_rate", "median_distance_mm"])
-def test_planes_nearer_to_the_labelled_one_are_better(make_training, figure):
+@pytest.mark.parametrize("metric", ["on_plane_rate", "median_distance_mm"])
+def test_planes_nearer_to_the_labelled_one_are_better(make_training, metric):
     trainings = [
         make_training(seed, params={"agent.lr": str(lr)}, mean_steps=steps)
         for lr, steps in ((1, 2), (2, 9))
         for seed in range(2)
     ]
-    (pair,) = compare_groups(group_trainings(trainings)[0])[figure]
+    (pair,) = compare_groups(group_trainings(trainings)[0])[metric]
     assert pair.probability.value == 1.0
 
 
@@ -99,9 +99,9 @@ def test_groups_judged_on_other_volumes_are_not_compared(written, make_training,
 
 def test_final_figures_are_of_all_seeds_volumes_and_episodes(make_training):
     (group,), _ = group_trainings([make_training(seed, mean_steps=steps) for seed, steps in enumerate((2, 4, 9))])
-    figures = final_metrics(group)
-    assert (figures.n_volumes, figures.n_episodes) == (2, 12)
-    assert figures.estimates["mean_steps"] == (5.0, 2.0, 9.0)
+    metrics = final_metrics(group)
+    assert (metrics.n_volumes, metrics.n_episodes) == (2, 12)
+    assert metrics.estimates["mean_steps"] == (5.0, 2.0, 9.0)
 
 
 def test_success_without_a_failure_has_the_interval_of_wilson(written, make_training):
@@ -174,10 +174,10 @@ def test_folds_of_a_grid_are_one_configuration_with_intervals_by_wrist(written, 
     groups, left_out = group_trainings(trainings)
     assert (len(groups), left_out) == (1, [])
     assert (groups[0].n_seeds, groups[0].n_folds) == (2, 3)
-    figures = final_metrics(groups[0])
-    assert (figures.n_seeds, figures.n_volumes, figures.n_episodes) == (2, 3, 24)
+    metrics = final_metrics(groups[0])
+    assert (metrics.n_seeds, metrics.n_volumes, metrics.n_episodes) == (2, 3, 24)
     # Both seeds are alike: the interval is of wrists.
-    assert figures.estimates["mean_steps"] == (5.0, 2.0, 9.0)
+    assert metrics.estimates["mean_steps"] == (5.0, 2.0, 9.0)
     page, _ = written(*trainings)
     assert "is a cross-validation: the figures on the test volumes are over 3 folds, each" in page
     assert "differ by nothing but the seed and the fold" in page
@@ -258,14 +258,14 @@ def test_end_that_excludes_one_half_is_not_rounded_to_it():
 def test_numbers_of_the_baselines_are_in_a_file(written, make_training):
     _, rows = written(make_training(0, baselines={"random": Evaluation((make_episode("a", 7),))}))
     of_random = [row for row in rows("final") if row["group"] == "random"]
-    assert [row["value"] for row in of_random if row["figure"] == "mean_steps"] == ["7.0"]
+    assert [row["value"] for row in of_random if row["metric"] == "mean_steps"] == ["7.0"]
 
 
 def test_figures_of_one_evaluation_are_of_all_its_episodes(make_training):
     episodes = [make_episode("a", 2), make_episode("b", 2), make_episode("b", 8)]
     (group,), _ = group_trainings([make_training(evaluation=Evaluation(tuple(episodes)))])
-    figures = final_metrics(group)
-    assert (figures.n_episodes, figures.estimates["mean_steps"].value) == (3, 4.0)
+    metrics = final_metrics(group)
+    assert (metrics.n_episodes, metrics.estimates["mean_steps"].value) == (3, 4.0)
 
 
 def test_one_tested_seed_is_told_also_among_seeds_that_were_only_searched_with(written, make_training):

@@ -56,7 +56,7 @@ def test_report_of_a_multirun_groups_its_jobs_and_has_every_number_beside_it(ans
     assert [(row["group"], row["seed"], row["status"]) for row in table] == [
         (group, str(seed), "finished") for group in GROUPS.values() for seed in range(3)
     ]
-    final = {(row["group"], row["figure"]): row for row in rows(folder / "final.csv")}
+    final = {(row["group"], row["metric"]): row for row in rows(folder / "final.csv")}
     for agent, group in GROUPS.items():
         of_seeds = [runs.client.get_run(run_id).data.metrics["test_volumes/mean_steps"] for run_id in runs.ids(agent)]
         row = final[group, "mean_steps"]
@@ -65,14 +65,14 @@ def test_report_of_a_multirun_groups_its_jobs_and_has_every_number_beside_it(ans
     history = runs.client.get_metric_history(runs.ids("sac")[0], "validation/mean_return")
     seeds = [row for row in rows(folder / "seed_curves.csv") if row["run"] == runs.ids("sac")[0]]
     assert [(point.step, point.value) for point in history] == [
-        (int(row["env_steps"]), float(row["value"])) for row in seeds if row["figure"] == "validation/mean_return"
+        (int(row["env_steps"]), float(row["value"])) for row in seeds if row["metric"] == "validation/mean_return"
     ]
-    curves = [row for row in rows(folder / "curves.csv") if row["figure"] == "validation/success_rate"]
+    curves = [row for row in rows(folder / "curves.csv") if row["metric"] == "validation/success_rate"]
     assert {(row["group"], row["axis"]) for row in curves} == {
         (group, axis) for group in GROUPS.values() for axis in ("environment steps", "seconds of training")
     }
     pairs = rows(folder / "improvement.csv")
-    assert [(row["figure"], row["better"], row["than"]) for row in pairs] == [
+    assert [(row["metric"], row["better"], row["than"]) for row in pairs] == [
         (figure, GROUPS["sac"], GROUPS["ppo"])
         for figure in ("on_plane_rate", "median_distance_mm", "success_rate", "mean_steps")
     ]

@@ -70,7 +70,7 @@ def check_result(folder):
     report = [sys.executable, "-m", "armscan", "report", "--study", "sac_y", "--out", "report"]
     subprocess.run(report, cwd=folder, check=True, stdout=subprocess.DEVNULL)
     of_agents = [row for row in rows(folder / "report" / "result.csv") if row["of"] == "agent"]
-    printed = {(row["trial"], row["figure"].removeprefix("test/")): float(row["value"]) for row in of_agents}
+    printed = {(row["trial"], row["metric"].removeprefix("test/")): float(row["value"]) for row in of_agents}
     episodes = {}
     for trial in trials_of(folder, "sac_y-judged"):
         name = "control" if trial.user_attrs["judged"] < 0 else str(trial.user_attrs["judged"])

@@ -86,7 +86,7 @@ def cause_of(trial: FrozenTrial) -> str:
 
 def _trial_row(trial: FrozenTrial, objectives: Sequence[str]) -> Row:
     values = dict(zip(objectives, trial.values or (), strict=False)) if trial.state == TrialState.COMPLETE else {}
-    metrics = {f"figure/{name}": value for name, value in trial.user_attrs.get(METRICS, {}).items()}
+    metrics = {f"metric/{name}": value for name, value in trial.user_attrs.get(METRICS, {}).items()}
     return {
         "trial": trial.number,
         "state": trial.state.name.lower(),
@@ -127,7 +127,7 @@ def _difference_rows(judgement: Judgement) -> Iterator[Row]:
     for each in judgement.differences:
         yield {
             "chosen": key_of(judgement.chosen),
-            "figure": f"{TEST_PREFIX}{each.metric}",
+            "metric": f"{TEST_PREFIX}{each.metric}",
             "seeds": judgement.n_seeds,
             **dict(zip(("difference", "low", "high"), each.estimate, strict=True)),
             **dict(zip(("probability", "probability_low", "probability_high"), each.probability, strict=True)),
@@ -141,7 +141,7 @@ def _result_rows(found: Sequence[ConfigResult]) -> Iterator[Row]:
             for name in figures.estimates:
                 value, low, high = figures.estimate(name)
                 row = {"trial": key_of(result.number), "of": of, "seeds": figures.n_seeds}
-                yield row | {"figure": f"{TEST_PREFIX}{name}", "value": value, "low": low, "high": high}
+                yield row | {"metric": f"{TEST_PREFIX}{name}", "value": value, "low": low, "high": high}
 
 
 def _importance_rows(study: optuna.Study, objectives: Sequence[str]) -> list[Row]:

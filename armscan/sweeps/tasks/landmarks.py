@@ -60,12 +60,12 @@ class LandmarksTask:
         rewards = self._rewards(attempt, "test")
         volumes = volumes_of(attempt.config(attempt.seeds[0])[0]).test
         attempt.keep_subjects({name: volume.subject or name for name, volume in volumes.items()})
-        figures = {f"{TEST_PREFIX}{name}": value for name, value in _metrics_of(rewards).items()}
+        metrics = {f"{TEST_PREFIX}{name}": value for name, value in _metrics_of(rewards).items()}
         for volume, pair in rewards.items():
             of_volume = _metrics_of({volume: pair})
             # The worst of all is no mean over the volumes.
-            figures |= {f"{TEST_PREFIX}volume/{volume}/{name}": of_volume[name] for name in METRICS[:-1]}
-        return figures
+            metrics |= {f"{TEST_PREFIX}volume/{volume}/{name}": of_volume[name] for name in METRICS[:-1]}
+        return metrics
 
     def _measured(self, attempt: Attempt, part: str) -> dict[str, float]:
         """Return the metrics on a part of the volumes."""

@@ -96,7 +96,7 @@ def test_report_is_one_page_with_every_number_beside_it(answer, tmp_path):
         ("pruned", "behind the others at environment step 100", "2"),
     ]
     (steps, success) = rows(folder / "result.csv")
-    assert (steps["figure"], float(steps["value"]), success["value"]) == ("test/mean_steps", 2.5, "1.0")
+    assert (steps["metric"], float(steps["value"]), success["value"]) == ("test/mean_steps", 2.5, "1.0")
     assert float(steps["low"]) < 2.5 < float(steps["high"])
     assert [row["key"] for row in rows(folder / "importances.csv")] == ["agent.lr"]
 
@@ -174,7 +174,7 @@ def test_report_shows_how_a_study_decided(answer, tmp_path, browser):
         "0": "not chosen",
     }
     steps, success = rows(folder / "differences.csv")
-    assert (steps["chosen"], steps["figure"], success["difference"]) == ("1", "test/mean_steps", "0.0")
+    assert (steps["chosen"], steps["metric"], success["difference"]) == ("1", "test/mean_steps", "0.0")
     assert float(steps["low"]) < float(steps["difference"]) < float(steps["high"]) < 0
     browser.open((folder / "report.html").as_uri())
     browser.count(".js-plotly-plot .main-svg", at_least=3)
