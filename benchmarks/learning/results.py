@@ -60,17 +60,17 @@ class Row:
 
 def _presets() -> dict[str, Row]:
     wanted = {
-        "best_y": ("1-DoF (y), SAC", 0.995, 1.3, 2),
-        "best_zy": ("2-DoF (zy), SAC", 0.99, 1.8, 5),
-        "best_full": ("4-DoF (full), SAC", 0.99, 1.8, 5),
-        "best_ppo_y": ("1-DoF (y), PPO", 0.98, 2.5, 8),
-        "best_ppo_zy": ("2-DoF (zy), PPO", 0.98, 2.5, 8),
-        "best_ppo_full": ("4-DoF (full), PPO", 0.98, 2.5, 8),
-        "best_full_exact": ("4-DoF, SAC, success threshold 0.01", 0.98, 3.0, 15),
-        "best_full_images": ("4-DoF, images, SAC", 0.97, 3.0, 60),
-        "best_zy_published_observation": ("2-DoF, actions and rewards alone, SAC, sampling", 0.97, 6.0, 15),
-        "best_full_distance": ("4-DoF, SAC, reward=agreement", None, None, None),
-        "best_full_taught": ("4-DoF, trained on labelled planes, reward=agreement", None, None, None),
+        "best_y": ("y, SAC", 0.995, 1.3, 2),
+        "best_zy": ("zy, SAC", 0.99, 1.8, 5),
+        "best_full": ("full, SAC", 0.99, 1.8, 5),
+        "best_ppo_y": ("y, PPO", 0.98, 2.5, 8),
+        "best_ppo_zy": ("zy, PPO", 0.98, 2.5, 8),
+        "best_ppo_full": ("full, PPO", 0.98, 2.5, 8),
+        "best_full_exact": ("full, SAC, success threshold 0.01", 0.98, 3.0, 15),
+        "best_full_images": ("full, images, SAC", 0.97, 3.0, 60),
+        "best_zy_published_observation": ("zy, actions and rewards alone, SAC, sampling", 0.97, 6.0, 15),
+        "best_full_distance": ("full, SAC, reward=agreement", None, None, None),
+        "best_full_taught": ("full, trained on labelled planes, reward=agreement", None, None, None),
     }
     return {name: Row(title, (f"experiment={name}",), *limits) for name, (title, *limits) in wanted.items()}
 
@@ -84,10 +84,10 @@ def _baselines() -> dict[str, Row]:
         "regression": ("regression", ("agent=regression",)),
     }
     tasks = {
-        "y": ("1-DoF", ("projection=y",)),
-        "zy": ("2-DoF", ("projection=zy",)),
-        "full": ("4-DoF", ("projection=full",)),
-        "full_exact": ("4-DoF, success threshold 0.01", ("projection=full", "env.success_threshold=0.01")),
+        "y": ("y", ("projection=y",)),
+        "zy": ("zy", ("projection=zy",)),
+        "full": ("full", ("projection=full",)),
+        "full_exact": ("full, success threshold 0.01", ("projection=full", "env.success_threshold=0.01")),
     }
     return {
         f"{agent}_{task}": Row(f"{of_task}, {of_agent}", (*agent_words, *task_words))

@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 
 from benchmarks.sweeps.bench.replay import Rule, search
-from benchmarks.sweeps.bench.warm_start import SimulatedSweep, best_that_fit, replays, share_of
+from benchmarks.sweeps.bench.warm_start import BEGUN, COLD, SimulatedSweep, best_that_fit, replays, share_of
 
 pytestmark = pytest.mark.filterwarnings("ignore::optuna.exceptions.ExperimentalWarning")
 RULE = Rule("tpe", "none")
@@ -34,7 +34,12 @@ def test_a_warm_start_from_the_same_space_saves_trials(surrogate):
     assert studies["trials"].cold.between(1, 40).all()
     assert share.value == pytest.approx(studies["trials"].warm.median() / studies["trials"].cold.median())
     # A cold study finds its own best, but another one may never find as good settings.
-    assert studies["trials"]["another cold"].between(1, 41).all()
-    assert (studies["trials"]["another cold"] == 41).any()
+    assert studies["trials"]["independent"].between(1, 41).all()
+    is_late = studies["trials"]["independent"] == 41
+    assert is_late.any()
+    assert ((studies["reached"]["independent"] == 0) == is_late).all()
+    # Each kind of study begins differently.
+    assert list(studies["trials"]) == [*COLD, *BEGUN]
+    assert not studies["trials"].T.duplicated().any()
     # Without pruning, each trial is a training.
     assert (studies["trainings"] == studies["trials"]).all(axis=None)

@@ -13,6 +13,7 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import argparse
+from itertools import product
 from pathlib import Path
 
 from armscan.errors import InvalidValueError
@@ -20,7 +21,7 @@ from benchmarks.sweeps.bench.collect import collect
 from benchmarks.sweeps.bench.ranking import SAMPLERS
 from benchmarks.sweeps.bench.replay import DEFAULT, silence
 from benchmarks.sweeps.bench.report import report, with_interval
-from benchmarks.sweeps.bench.warm_start import SimulatedSweep, replays, share_of
+from benchmarks.sweeps.bench.warm_start import BEGUN, COLD, UNITS, SimulatedSweep, replays, share_of
 
 
 def main() -> None:
@@ -47,7 +48,7 @@ def main() -> None:
     )
     replaying.add_argument("--workers", type=int, default=1, help="processes that simulate (default: 1)")
     replaying.add_argument("--picture", type=Path, help="a PNG file that is written")
-    starting = commands.add_parser("warm-start", help="simulate studies that begin with the best settings of others")
+    starting = commands.add_parser("warm-start", help="simulate studies that begin with known settings")
     starting.add_argument("source", help="name of the sweep that the settings are from, such as sac_y")
     starting.add_argument("target", help="name of the sweep that begins with them, such as sac_zy")
     starting.add_argument("--studies", type=int, default=20, help="studies (default: 20)")
@@ -69,9 +70,11 @@ def _run(given: argparse.Namespace) -> None:
         target = SimulatedSweep.of(given.target, given.pruner)
         studies = replays(SimulatedSweep.of(given.source), target, given.studies)
         print(studies.to_string())
-        for unit, without in studies.columns.drop("warm", level=1):
-            share = share_of(studies[unit, "warm"], studies[unit, without])
-            print(f"{unit}, median of warm over {without}: {with_interval(share, '.2f')}")
+        for kind, n_reached in studies["reached"].sum().items():
+            print(f"{kind}: {n_reached:.0f} of {len(studies)} reach the goal")
+        for unit, kind, cold in product(UNITS, BEGUN, COLD):
+            share = share_of(studies[unit, kind], studies[unit, cold])
+            print(f"{unit}, median of {kind} over {cold}: {with_interval(share, '.2f')}")
     else:
         report(
             given.sweep,

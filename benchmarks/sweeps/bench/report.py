@@ -10,10 +10,11 @@ from typing import Any
 import pandas as pd
 
 from armscan.errors import InvalidValueError
+from armscan.utils.arrays import FloatArray
 from armscan.utils.text import markdown_table
 from benchmarks.sweeps.bench.importance import Key, keys_of
 from benchmarks.sweeps.bench.picture import draw
-from benchmarks.sweeps.bench.power import needed_seeds, power_of, residuals_of_good_configs
+from benchmarks.sweeps.bench.power import needed_seeds, power_of, residuals_of
 from benchmarks.sweeps.bench.races import FIXED, N_SEEDS, RACES, Choices, Comparison, candidates_of, choices_of, compare
 from benchmarks.sweeps.bench.ranking import FINALS, SAMPLERS, ranked, rules, studies_of
 from benchmarks.sweeps.bench.replay import DEFAULT
@@ -48,8 +49,8 @@ def report(
     curves = Curves.read(sweep)
     surrogate = Surrogate.of(curves)
     _print_table(curves, surrogate)
-    power = power_of(surrogate)
-    _print_power(power)
+    for name, residuals in residuals_of(surrogate).items():
+        _print_power(name, residuals)
     keys = keys_of(curves, n_resamples)
     _print_keys(keys)
     found = candidates_of(surrogate, sweep, DEFAULT, n_studies=n_studies, n_trainings=n_trainings, top_k=max(TOP_KS))
@@ -93,21 +94,19 @@ def _print_table(curves: Curves, surrogate: Surrogate) -> None:
         ("mean steps in the test: the default configuration, the best of the surrogate", f"{default:.2f}, {truth:.2f}"),
         ("the best of the surrogate", ", ".join(f"`{name}={value:.3g}`" for name, value in best.items())),
         ("configurations left out: rank correlation, variance explained", f"{correlation:.2f}, {explained:.2f}"),
-        (
-            "noise between seeds of good configurations, in % of the steps",
-            f"{100 * residuals_of_good_configs(surrogate).std():.0f}",
-        ),
     ]
     print(f"\n## {curves.sweep}\n\n{markdown(['', ''], rows)}", flush=True)
 
 
-def _print_power(power: pd.DataFrame) -> None:
+def _print_power(name: str, residuals: FloatArray) -> None:
+    power = power_of(residuals)
     needed = needed_seeds(power)
     rows = [
         # Rounded down, so that no share below 80 % reads as 80 %.
         (f"{difference:.0%}", *(f"{floor(100 * share)}%" for share in row), needed.get(float(difference), "") or "none")
         for difference, row in power.iterrows()
     ]
+    print(f"\nNoise between seeds of {name}: {100 * residuals.std():.0f} % of the steps")
     print(f"\n{markdown(['difference', *power.columns, 'first with 80 %'], rows)}", flush=True)
 
 

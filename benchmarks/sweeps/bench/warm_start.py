@@ -1,4 +1,4 @@
-"""Trials and trainings that a warm start saves until a study finds the best settings of a study without one."""
+"""Trials and trainings until studies that begin with known settings find the best ones of a study that does not."""
 
 from __future__ import annotations
 
@@ -16,9 +16,14 @@ from armscan.sweeps.space.parameter import Value
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.study.warm_start import first_different
 from armscan.utils.arrays import FloatArray
+from benchmarks.sweeps.bench.design import presets_of
 from benchmarks.sweeps.bench.replay import DEFAULT, Rule, Search, search
 from benchmarks.sweeps.bench.surrogate import Surrogate
 from benchmarks.sweeps.bench.table import Curves
+
+# Studies that begin with nothing, and those that begin with settings of another study, of presets, or of both.
+COLD, BEGUN = ("cold", "independent"), ("warm", "preset", "preset, warm")
+UNITS = ("trials", "trainings")
 
 
 class SimulatedSweep(NamedTuple):
@@ -50,10 +55,11 @@ class SimulatedSweep(NamedTuple):
 
 
 def replays(source: SimulatedSweep, target: SimulatedSweep, n_studies: int) -> pd.DataFrame:
-    """Simulate each study cold, with a warm start from a study of the source and the same seed, and cold again.
+    """Simulate each study cold, with a warm start, with the presets of the sweep, with both, and independently.
 
-    The second cold study has another seed. The first always finds its own best settings, which may be lucky; another
-    study finds settings as good in only half of the cases, so a warm start is compared with both.
+    A warm start tries the best settings of a study of the source with the same seed first. The independent study is
+    cold, too, with another seed: a cold study always finds its own best settings, which may be lucky, another one in
+    only half of the cases. So the others are compared with both.
 
     Args:
         source: Sweep whose best settings are tried first.
@@ -61,19 +67,23 @@ def replays(source: SimulatedSweep, target: SimulatedSweep, n_studies: int) -> p
         n_studies: Number of studies of each kind.
 
     Returns:
-        A row for each study, with columns (`trials` or `trainings`, `cold`, `warm` or `another cold`): the number until
-        the truly best settings of the cold study, or better ones, have run to their end; one more than all if they
-        never do.
+        A row for each study, with columns (`trials`, `trainings` or `reached`, one of `COLD` or of `BEGUN`): the number
+        until the truly best settings of the cold study, or better ones, have run to their end, one more than all if
+        they never do; and 1 if they do, else 0.
     """
+    presets = presets_of(target.sweep, target.surrogate.space)
     rows = []
     for seed in range(n_studies):
-        known = _search(source, seed)
-        cold = _search(target, seed)
-        warm = _search(target, seed, best_that_fit(known, target.surrogate.space))
-        goal = min(each.config.truth for each in cold.candidates)
-        another = _search(target, n_studies + seed)
-        found = {"cold": _until(cold, goal), "warm": _until(warm, goal), "another cold": _until(another, goal)}
-        rows.append(pd.DataFrame(found).stack())
+        known = best_that_fit(_search(source, seed), target.surrogate.space)
+        searches = {
+            "cold": _search(target, seed),
+            "independent": _search(target, n_studies + seed),
+            "warm": _search(target, seed, known),
+            "preset": _search(target, seed, presets),
+            "preset, warm": _search(target, seed, (*presets, *known)),
+        }
+        goal = min(each.config.truth for each in searches["cold"].candidates)
+        rows.append(pd.DataFrame({kind: _until(found, goal) for kind, found in searches.items()}).stack())
     return pd.DataFrame(rows)
 
 
@@ -83,18 +93,18 @@ def best_that_fit(found: Search, space: Space) -> tuple[dict[str, Value], ...]:
     return first_different(chosen for chosen, misfit in fits if chosen and misfit is None)
 
 
-def share_of(warm: pd.Series, cold: pd.Series) -> Estimate:
-    """Return the median with a warm start over the median without, with a 95 % bootstrap interval over studies.
+def share_of(begun: pd.Series, cold: pd.Series) -> Estimate:
+    """Return the median of begun studies over that of cold ones, with a 95 % bootstrap interval over studies.
 
     Args:
-        warm: Trials or trainings of each study with a warm start.
-        cold: Trials or trainings of each study without, in the same order.
+        begun: Trials or trainings of each study that begins with known settings.
+        cold: Trials or trainings of each study that does not, in the same order.
     """
 
-    def share(warm: FloatArray, cold: FloatArray, axis: int = -1) -> FloatArray:
-        return np.asarray(np.median(warm, axis=axis) / np.median(cold, axis=axis))
+    def share(begun: FloatArray, cold: FloatArray, axis: int = -1) -> FloatArray:
+        return np.asarray(np.median(begun, axis=axis) / np.median(cold, axis=axis))
 
-    samples = warm.to_numpy(), cold.to_numpy()
+    samples = begun.to_numpy(), cold.to_numpy()
     drawn = bootstrap(samples, share, paired=True, method="percentile", rng=np.random.default_rng(0))
     return Estimate(float(share(*samples)), *map(float, drawn.confidence_interval))
 
@@ -108,5 +118,5 @@ def _until(found: Search, goal: float) -> dict[str, float]:
     reached = [each for each in found.candidates if each.config.truth <= goal]
     first = min(reached, key=lambda each: each.number, default=None)
     if first is None:
-        return {"trials": found.n_trials + 1.0, "trainings": found.n_trainings + 1.0}
-    return {"trials": first.number + 1.0, "trainings": first.n_trainings}
+        return {"trials": found.n_trials + 1.0, "trainings": found.n_trainings + 1.0, "reached": 0.0}
+    return {"trials": first.number + 1.0, "trainings": first.n_trainings, "reached": 1.0}
