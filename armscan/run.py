@@ -4,7 +4,13 @@ from __future__ import annotations
 
 import os
 
-from armscan.utils.processes import collect_garbage_rarely, discard_output, limit_threads, no_garbage_collection
+from armscan.utils.processes import (
+    collect_garbage_rarely,
+    discard_output,
+    interruptions,
+    limit_threads,
+    no_garbage_collection,
+)
 
 limit_threads()
 collect_garbage_rarely()
@@ -115,8 +121,10 @@ def main() -> int:
         os.environ[TRACEBACKS] = "1"
     # Makes Hydra raise its errors, so that they are reported here.
     os.environ["HYDRA_FULL_ERROR"] = "1"
-    # Treat SIGTERM like Ctrl-C: the run is closed as KILLED in the tracking store.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    # All like Ctrl-C, which Python handles: the run is closed as KILLED in the tracking store.
+    for each in interruptions():
+        if each != signal.SIGINT:
+            signal.signal(each, signal.default_int_handler)
     silence_libraries()
     # Hydra reads its options only before the first override, but users type them anywhere.
     sys.argv[1:] = sorted(sys.argv[1:], key=lambda each: each not in MULTIRUN)

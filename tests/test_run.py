@@ -378,7 +378,8 @@ def test_run_shows_what_is_wrong_with_a_volume(answer, tmp_path, write_labelmap,
 
 @pytest.mark.full
 @pytest.mark.parametrize("multirun", [[], ["-m", "seed=0,1", "hydra.launcher.n_jobs=2"]], ids=["single", "multirun"])
-def test_interrupted_run_is_closed_as_killed(tmp_path, multirun):
+@pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGHUP], ids=["Ctrl-C", "closed terminal"])
+def test_interrupted_run_is_closed_as_killed(tmp_path, multirun, ending):
     process = start_run(*multirun, *SMALL, "training.env_steps=500000", cwd=tmp_path)
     n_jobs = 2 if multirun else 1
 
@@ -389,7 +390,7 @@ def test_interrupted_run_is_closed_as_killed(tmp_path, multirun):
         return sum(count >= 2 for count in told.values()) if multirun else min(1, sum(told.values()) // 2)
 
     wait_until(lambda: n_at_work() >= n_jobs, process=process, log=(tmp_path / "printed").read_text, poll_s=0.5)
-    os.killpg(process.pid, signal.SIGINT)
+    os.killpg(process.pid, ending)
     assert process.wait(HANG_S) == 130
     output = (tmp_path / "printed").read_text()
     assert output.rstrip().endswith("interrupted")

@@ -15,9 +15,7 @@ from omegaconf import DictConfig
 
 from armscan.config.error_messages import one_line_message
 from armscan.experiment.job import INTERRUPTED, NO_OUTCOME, Invocation, Job, remove_if_untracked
-from armscan.utils.processes import ProcessInfo, child_command, on_exit, on_parent_exit
-
-ENDINGS = (signal.SIGINT, signal.SIGTERM)
+from armscan.utils.processes import ProcessInfo, child_command, interruptions, on_exit, on_parent_exit
 
 
 def start_job(config: DictConfig, invocation: Invocation, job: Job) -> None:
@@ -56,6 +54,7 @@ def run_job(launcher_pid: int) -> None:
     on_parent_exit(launcher_pid, partial(os.kill, os.getpid(), signal.SIGTERM))
     config, invocation = pickle.load(sys.stdin.buffer)
     job: Job = invocation.job
+    endings = interruptions()
 
     def leave(*_: object) -> None:
         """End the job at once, without an exception, which compiled code can turn into any other error."""
@@ -64,12 +63,12 @@ def run_job(launcher_pid: int) -> None:
 
     def end(**outcome: Any) -> None:
         """Write the outcome, and ignore later interrupts."""
-        for ending in ENDINGS:
-            signal.signal(ending, signal.SIG_IGN)
+        for each in endings:
+            signal.signal(each, signal.SIG_IGN)
         job.write_outcome(**outcome)
 
-    for ending in ENDINGS:
-        signal.signal(ending, leave)
+    for each in endings:
+        signal.signal(each, leave)
     try:
         if job.repeats is not None:
             from armscan.launch.resume_grid import run_again

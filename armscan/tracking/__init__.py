@@ -1,7 +1,7 @@
 """MLflow tracking: the store, its runs, and their plots."""
 
 from armscan.tracking.environment import environment_file, environment_tags
-from armscan.tracking.git import code_state
+from armscan.tracking.git import code_state, code_version
 from armscan.tracking.lookup import (
     FoundRun,
     check_run_id,
@@ -30,6 +30,7 @@ __all__ = [
     "check_run_id",
     "check_version",
     "code_state",
+    "code_version",
     "draw_learning_curve",
     "environment_file",
     "environment_tags",

@@ -11,6 +11,7 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
+import armscan
 from armscan.tracking.tags import COMMIT_TAG, UNKNOWN
 from armscan.utils.files import sha256
 
@@ -20,6 +21,7 @@ MAX_UNTRACKED_BYTES = 2**20
 # Override the user's settings of `git diff`, which could break `git apply`.
 PLAIN = ("--no-ext-diff", "--no-textconv", "--no-color", "--binary", "--src-prefix=a/", "--dst-prefix=b/")
 TIMEOUT_S = 30.0
+COMMIT_CHARS, SOURCE_CHARS = 9, 12
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,15 @@ class CodeState:
 def code_state() -> CodeState:
     """Return the state of the code, read once per process, because loaded code does not change."""
     return code_state_in(Path(__file__).parent)
+
+
+@functools.cache
+def code_version() -> str:
+    """Return armscan's commit, or its version outside of git, and a checksum of its source, read once per process."""
+    commit, package = code_state().commit, Path(armscan.__file__).parent
+    sources = (f"{file.relative_to(package)}\0".encode() + file.read_bytes() for file in sorted(package.rglob("*.py")))
+    version = armscan.__version__ if commit == UNKNOWN else commit[:COMMIT_CHARS]
+    return f"{version} {sha256(b''.join(sources))[:SOURCE_CHARS]}"
 
 
 def code_state_in(folder: Path) -> CodeState:

@@ -20,7 +20,7 @@ STUDIES = re.compile(r"/api/studies(/\d+)?")
 LOCAL_RUNS = re.compile(rf"http://127\.0\.0\.1:{MLFLOW_PORT}(?=/#/)")
 # Attributes that identify trials of armscan.
 OF_TRIAL = {names.LEASE, names.CONFIG_SHA256, names.FINALIST}
-HIDDEN_OF_STUDY = names.OF_STUDY | {names.STUDY_RUN, names.NOTE_SUM, names.RESET_FAILURES}
+HIDDEN_OF_STUDY = names.OF_STUDY | {names.STUDY_RUN, names.BEGUN_IN, names.NOTE_SUM, names.RESET_FAILURES}
 # The note has the run, the folder and the metrics of the seeds.
 HIDDEN = {
     *(names.LEASE, names.METRICS, names.SEEDS, names.CONFIG_SHA256, names.OF_CONFIG),

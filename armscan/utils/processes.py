@@ -6,6 +6,7 @@ import atexit
 import gc
 import json
 import os
+import signal
 import socket
 import sys
 import threading
@@ -54,6 +55,12 @@ def discard_output() -> None:
     """Discard what is still printed: the reader of this process's output, such as `head`, has ended."""
     # Otherwise the interpreter fails on exit, when it writes the rest.
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def interruptions() -> list[signal.Signals]:
+    """Return the signals that end a process like Ctrl-C: also that of a closed terminal, unless `nohup` ignores it."""
+    closed = [signal.SIGHUP] if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN else []
+    return [signal.SIGINT, signal.SIGTERM, *closed]
 
 
 @contextmanager

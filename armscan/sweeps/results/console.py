@@ -16,6 +16,7 @@ from armscan.experiment.console import print_result_table, print_where_to_look
 from armscan.sweeps.results.difference import HOW
 from armscan.sweeps.results.final_results import final_table
 from armscan.sweeps.results.judgement import judge
+from armscan.sweeps.results.notes import notes_on
 from armscan.sweeps.results.progress import status_line
 from armscan.sweeps.results.selection import candidates_of, objective_of
 from armscan.sweeps.scheduling.population import searched_values
@@ -25,7 +26,7 @@ from armscan.sweeps.storage.attributes import check_trials
 from armscan.sweeps.study.candidates import NOTHING_SEARCHED
 from armscan.sweeps.study.final_eval import FinalEvaluation
 from armscan.sweeps.study.phase import OpenedStudy
-from armscan.sweeps.study.study import best_trials, change_notes
+from armscan.sweeps.study.study import best_trials
 from armscan.sweeps.tasks.attempt import trial_folder
 from armscan.training.metric_display import title_of, value_text
 from armscan.utils.console import WHOLE_CHARS, print_sentence, wide_console
@@ -78,7 +79,7 @@ def _print_best(opened: OpenedStudy) -> None:
     for trial in best:
         print_sentence(f"trial {trial.number}: {' '.join(rounded_overrides(searched_values(trial)))}")
     # A judgement has these notes too.
-    for note in () if opened.final_eval is not None else change_notes(opened.search.scheduler.study):
+    for note in () if opened.final_eval is not None else notes_on(opened.search.scheduler.study):
         print_sentence(printable(f"note: {note}"))
 
 

@@ -11,11 +11,11 @@ from optuna.trial import TrialState
 from armscan.experiment.results import volume_notes
 from armscan.sweeps.results.difference import Difference, differences_of
 from armscan.sweeps.results.final_results import ConfigResult, final_results
+from armscan.sweeps.results.notes import code_notes, notes_on
 from armscan.sweeps.scheduling.state import CONTROL
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.study.candidates import name_of, settings_of, training_of
 from armscan.sweeps.study.final_eval import FinalEvaluation, to_judge
-from armscan.sweeps.study.study import change_notes
 from armscan.training.baselines import RANDOM
 from armscan.training.headline import headline
 from armscan.training.metric_display import title_of
@@ -38,7 +38,7 @@ class Judgement:
         have_others_failed: Whether a training of every other candidate failed in the race. Default: False.
         violated: Constraints of the study that configurations violated in the race. Default: none.
         is_repeated: Whether trainings with an earlier configuration of the study were judged before. Default: False.
-        changes: Notes on changes of the study's configuration. Default: none.
+        changes: Notes on changes of the study's configuration and of armscan's code. Default: none.
     """
 
     chosen: int
@@ -162,6 +162,10 @@ def judge(final: FinalEvaluation) -> Judgement | None:
         n_unjudged=final.n_unjudged,
         violated={number: each for number, each in final.violated().items() if number in race.standings},
         is_repeated=not all(map(final.is_current, complete)),
-        changes=change_notes(final.search),
+        changes=[
+            *notes_on(final.search),
+            *code_notes(final.selection, "the trainings of the selection"),
+            *code_notes(final.judgement, "the trainings of the judgement"),
+        ],
         have_others_failed=bool(of_others) and all(standing.has_failed for standing in of_others),
     )

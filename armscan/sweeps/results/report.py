@@ -16,6 +16,7 @@ from armscan.sweeps.results.csv_tables import all_numbers, cause_of
 from armscan.sweeps.results.difference import HOW
 from armscan.sweeps.results.final_results import ConfigResult, final_results, final_table
 from armscan.sweeps.results.judgement import Judgement, judge
+from armscan.sweeps.results.notes import notes_on
 from armscan.sweeps.results.population_charts import population_charts
 from armscan.sweeps.results.selection import candidates_of, decision_section
 from armscan.sweeps.scheduling.state import StudyState, env_steps_of, is_feasible, was_retried
@@ -33,7 +34,7 @@ from armscan.sweeps.storage.attribute_names import (
 )
 from armscan.sweeps.study.candidates import name_of, settings_of
 from armscan.sweeps.study.final_eval import FinalEvaluation
-from armscan.sweeps.study.study import best_trials, change_notes
+from armscan.sweeps.study.study import best_trials
 from armscan.training.metric_display import title_of, value_text
 from armscan.utils.run_files import ID_CHARS
 from armscan.utils.text import counted
@@ -110,7 +111,7 @@ def _summary(study: optuna.Study, state: StudyState, best: Sequence[FrozenTrial]
         values = zip(objectives, best[0].values, strict=True)
         said = "; ".join(f"{title_of(name)} {value_text(name, value)}" for name, value in values)
         text += f" Best in the search: trial {best[0].number}, {html.escape(said)} (optimistically biased)."
-    text += "".join(f" Note: {html.escape(note)}." for note in change_notes(study))
+    text += "".join(f" Note: {html.escape(note)}." for note in notes_on(study))
     return f"<p>{text}</p>"
 
 

@@ -6,6 +6,8 @@ SPACE, FIXED, OBJECTIVES = "space", "fixed_config", "objectives"
 OF_STUDY = {SPACE, FIXED, OBJECTIVES}
 # The configurations of earlier trials, each by the number of the first trial after it.
 EARLIER_CONFIGS = "earlier_configs"
+# The machine and folder that it was begun in, with a random ID, which that folder has too.
+BEGUN_IN = "begun_in"
 # Its tracked run, the SHA-256 of armscan's own note in the dashboard, and the origins of its initial trials.
 STUDY_RUN, NOTE_SUM, BEGUN_WITH = "mlflow_run", "note_sha256", "begun_with"
 # Why it has ended, and the settings asked for at that time, or, once it is reopened, the number of trials finished by
@@ -37,7 +39,8 @@ KEPT_BY_RETRY = (
     *(MEMBER, GENERATION, INTERVAL, PARENT, SCHEDULE),
 )
 
-# In a lease: the worker that holds the trial.
-HOLDER = ("worker", "host", "pid", "started", "boot", "pid_namespace")
+# In a lease: the version of armscan's code, see `code_version`; the worker that holds the trial.
+CODE = "code"
+HOLDER = ("worker", "host", "pid", "started", "boot", "pid_namespace", CODE)
 # System attributes of a trial: the episodes of the final evaluation; without episodes, the subject of each test volume.
 EPISODES, SUBJECTS = "episodes", "subjects"

@@ -58,6 +58,7 @@ class StudyAttributes(_Attributes):
         default={}, description="configurations by trial numbers"
     )
     mlflow_run: Text = ""
+    begun_in: Text = ""
     note_sha256: Text = ""
     stop: Text = ""
     forgiven: list[Number] = Field(default=[], description="a list of numbers of trials")
@@ -67,6 +68,7 @@ class StudyAttributes(_Attributes):
 
 class _Lease(_Attributes):
     worker: Text = ""
+    code: Text = ""
     host: Text = ""
     started: Text = ""
     directory: Text = ""

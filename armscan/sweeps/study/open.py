@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import socket
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from uuid import uuid4
 
 import optuna
 from omegaconf import DictConfig
 
 from armscan.config.defaults import to_plain
-from armscan.errors import StudyError
+from armscan.errors import StudyError, printable
 from armscan.sweeps.scheduling.limits import Limits
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
 from armscan.sweeps.scheduling.termination import Termination
-from armscan.sweeps.storage.attribute_names import STUDY_RUN
+from armscan.sweeps.storage.attribute_names import BEGUN_IN, STUDY_RUN
 from armscan.sweeps.storage.storage import Storage, open_storage
 from armscan.sweeps.study.candidates import training_of
 from armscan.sweeps.study.components import make_as
@@ -33,11 +35,12 @@ from armscan.sweeps.study.warm_start import values_of
 from armscan.sweeps.tasks.attempt import Task
 from armscan.tracking import TrackingStore, code_state, open_store, run_of_study
 from armscan.tracking.tags import OVERRIDES_TAG, STORAGE_TAG, STUDY_TAG, TRIAL_TAG
+from armscan.utils.console import print_sentence
 from armscan.utils.files import atomic_write
 from armscan.utils.retry import RETRY_S
 
 NO_END = 10**9
-# In the folder of a study: its name.
+# In the folder of a study: its name, and in a second line the folder that it was begun in, with a random ID.
 OWNER_FILE = "study_name"
 
 
@@ -70,9 +73,13 @@ def open_for_work(
         Path(folder).mkdir(parents=True, exist_ok=True)
     storage = open_storage(settings.storage, retry=retry)
     study = make_study(storage, settings, fixed_config(config, overrides, volumes))
+    is_command = volumes is not None
     _claim_folder(Path(settings.folder), study)
-    objectives = tuple(settings.objectives)
+    begun_in, is_here = _begun_in(Path(settings.folder), study, storage)
     population = population_of(settings, config)
+    if not is_here:
+        _check_elsewhere(settings, begun_in, is_population=population is not None, is_command=is_command)
+    objectives = tuple(settings.objectives)
     plan = None if population is None else lambda: population.plan(study.get_trials(deepcopy=False))
     search = Phase(
         name=settings.name,
@@ -90,7 +97,7 @@ def open_for_work(
         experiment_id=experiment_id,
         # Workers do not know the volumes.
         run_id=_tracked_run(
-            study, storage, store, experiment_id, Path(settings.folder), overrides, is_command=volumes is not None
+            study, storage, store, experiment_id, Path(settings.folder), overrides, is_command=is_command
         ),
         population=population,
     )
@@ -109,10 +116,37 @@ def _claim_folder(folder: Path, study: optuna.Study) -> None:
         # Earlier versions wrote no name.
         is_known = folder.name == name or not (folder / "trials").exists() or bool(study.get_trials(deepcopy=False))
         atomic_write(file, name if is_known else "another study")
-    if (owner := file.read_text().strip()) != name:
+    if (owner := file.read_text().partition("\n")[0].strip()) != name:
         raise StudyError(
             f"study.folder is {str(folder)!r}, which has the files of {owner}: give study.folder another value"
         )
+
+
+def _begun_in(folder: Path, study: optuna.Study, storage: Storage) -> tuple[str, bool]:
+    """Return the folder that a study was begun in, with its machine, and whether this is it, seen from anywhere."""
+    file = folder / OWNER_FILE
+    of_folder = file.read_text().partition("\n")[2].strip()
+
+    def of_study() -> str:
+        if BEGUN_IN not in study.user_attrs:
+            begun_in = of_folder or f"{socket.gethostname()}:{folder.absolute()} {uuid4().hex[:8]}"
+            atomic_write(file, f"{study.study_name}\n{begun_in}\n")
+            study.set_user_attr(BEGUN_IN, begun_in)
+        return str(study.user_attrs[BEGUN_IN])
+
+    begun_in = storage.exclusive(of_study)
+    # The ID is what counts: machines may see the folder by other paths, or under the same path another folder.
+    is_here = begun_in == file.read_text().partition("\n")[2].strip()
+    return begun_in.rpartition(" ")[0], is_here
+
+
+def _check_elsewhere(settings: StudySettings, begun_in: str, *, is_population: bool, is_command: bool) -> None:
+    """Refuse a folder without the checkpoints that a population copies; for other studies, print what it means."""
+    where = f"study.folder is {settings.folder!r}, but the study {settings.name} was begun in {begun_in}"
+    if is_population:
+        raise StudyError(f"{where}: its members copy checkpoints there, so type the command there, or set study.folder")
+    if is_command:
+        print_sentence(printable(f"note: {where}: trials that were interrupted there begin anew here"))
 
 
 def _tracked_run(

@@ -38,6 +38,8 @@ from armscan.utils.files import sha256
 from armscan.utils.validation import check_float
 
 TRIAL_DIGITS, N_SUM_CHARS = 4, 12
+# Why a run has ended whose worker was taken for dead.
+TAKEN_OVER = "taken over by another worker"
 
 
 @dataclass

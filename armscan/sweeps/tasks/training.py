@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import optuna
 from omegaconf import DictConfig
+from optuna.exceptions import UpdateFinishedTrialError
 
 from armscan.agents import Learner
 from armscan.config.defaults import to_plain
@@ -30,7 +31,7 @@ from armscan.experiment.results import RunResult
 from armscan.experiment.runner import log_result, train_agent
 from armscan.sweeps.scheduling.limits import LimitReachedError
 from armscan.sweeps.scheduling.state import TEST_PREFIX
-from armscan.sweeps.tasks.attempt import Attempt, over_seeds, volumes_of
+from armscan.sweeps.tasks.attempt import TAKEN_OVER, Attempt, over_seeds, volumes_of
 from armscan.sweeps.tasks.generation import begin_generation
 from armscan.sweeps.tasks.reporter import TRAINING_METRICS, Reporter
 from armscan.tracking import TrackedRun, TrackingStore, draw_learning_curve, open_store, run_of_study, take_over
@@ -176,6 +177,9 @@ def _train(attempt: Attempt, seed: int, conclude: Conclude | None = None) -> dic
                 tracked.set_pruned()
             except LimitReachedError:
                 tracked.end_requeued()
+                raise
+            except UpdateFinishedTrialError:
+                tracked.end("FAILED", reason=TAKEN_OVER)
                 raise
             else:
                 concluded = conclude(setup, result, tracked, folder) if conclude else {}

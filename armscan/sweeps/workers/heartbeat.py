@@ -16,7 +16,8 @@ from armscan.sweeps.scheduling.claim import PendingWrites, TrialOutcome
 from armscan.sweeps.scheduling.limits import LimitReachedError
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
 from armscan.sweeps.scheduling.state import BEAT_S
-from armscan.sweeps.storage.attribute_names import HOLDER, LEASE, STOP
+from armscan.sweeps.storage.attribute_names import CODE, HOLDER, LEASE, STOP
+from armscan.tracking import code_version
 from armscan.utils.log import log
 from armscan.utils.processes import ProcessInfo
 
@@ -87,7 +88,12 @@ class Heartbeat:
         on_death: Callable[[FrozenTrial], None],
         should_leave_soon: Callable[[], bool] = lambda: False,
     ) -> None:
-        self._lease: dict[str, Any] = {"worker": worker, **asdict(ProcessInfo.current()), "beat": 0}
+        self._lease: dict[str, Any] = {
+            "worker": worker,
+            CODE: code_version(),
+            **asdict(ProcessInfo.current()),
+            "beat": 0,
+        }
         self._scheduler, self._liveness = scheduler, LivenessCheck()
         self._should_leave, self._leave, self._on_death = should_leave, leave, on_death
         self._should_leave_soon = should_leave_soon

@@ -33,7 +33,7 @@ from armscan.tracking.store import store_errors
 from armscan.tracking.sync import IN_USE
 from armscan.training.episode_results import TEST_METRICS
 from armscan.utils.console import print_sentence
-from armscan.utils.processes import ProcessInfo
+from armscan.utils.processes import ProcessInfo, interruptions
 from armscan.utils.retry import no_retry
 
 # Time that workers have to leave before their launcher is interrupted and those on this machine are killed; workers on
@@ -156,10 +156,7 @@ def _leaving(
         (folder / STOP_FILE).touch()
         signal.setitimer(signal.ITIMER_REAL, leave_s)
 
-    asking = [signal.SIGINT, signal.SIGTERM, signal.SIGALRM]
-    # The terminal was closed; ignored under `nohup`.
-    asking += [signal.SIGHUP] if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN else []
-    before = {each: signal.signal(each, ask) for each in asking}
+    before = {each: signal.signal(each, ask) for each in (*interruptions(), signal.SIGALRM)}
     try:
         yield
     except BaseException:

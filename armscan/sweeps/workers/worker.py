@@ -28,7 +28,7 @@ from armscan.sweeps.study.components import make, read_settings
 from armscan.sweeps.study.dashboard import named_as_of_runs, note_run, show_picture, shown_metrics, table_of_seeds
 from armscan.sweeps.study.open import open_for_work
 from armscan.sweeps.study.phase import Phase
-from armscan.sweeps.tasks.attempt import Attempt, check_metrics, config_sha256, trial_folder
+from armscan.sweeps.tasks.attempt import TAKEN_OVER, Attempt, check_metrics, config_sha256, trial_folder
 from armscan.sweeps.workers.heartbeat import Heartbeat
 from armscan.sweeps.workers.trial_run import close_requeued, open_run
 from armscan.tracking import TrackedRun
@@ -206,7 +206,7 @@ class Worker:
     def _let_go(self, trial: Trial, tracked: TrackedRun | None) -> None:
         log(f"trial {trial.number} was taken over by another worker")
         if tracked is not None:
-            tracked.end("FAILED", reason="taken over by another worker")
+            tracked.end("FAILED", reason=TAKEN_OVER)
 
 
 def work(overrides: Sequence[str], make_heartbeat: Callable[..., Heartbeat]) -> None:

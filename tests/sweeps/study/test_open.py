@@ -1,5 +1,9 @@
 """A study opened for work, and the runs of the tracking store that its storage names."""
 
+import re
+import shutil
+from types import SimpleNamespace
+
 import optuna
 import pytest
 from optuna.trial import TrialState
@@ -142,3 +146,28 @@ def test_folder_that_an_earlier_version_has_given_another_study_is_refused(tmp_p
     (tmp_path / "shared" / "trials").mkdir(parents=True)
     with pytest.raises(StudyError, match="which has the files of another study"):
         _claim_folder(tmp_path / "shared", study)
+
+
+@pytest.mark.parametrize("is_population", [False, True])
+def test_study_that_was_begun_in_another_folder_notes_it_and_a_population_is_refused(
+    opened, monkeypatch, capsys, is_population
+):
+    monkeypatch.setattr(
+        "armscan.sweeps.study.open.population_of", lambda *_: SimpleNamespace() if is_population else None
+    )
+    first = opened(volumes={}).folder
+    moved = first.rename(first.with_name("moved"))
+    where = rf"study.folder is 'studies/a', but the study a was begun in [^ ]+:{re.escape(str(first.absolute()))}: "
+    if is_population:
+        with pytest.raises(StudyError, match=f"{where}its members copy checkpoints there"):
+            opened(volumes={})
+    else:
+        assert opened().folder == first
+        assert capsys.readouterr().out == ""
+        opened(volumes={})
+        assert re.match(f"note: {where}trials that were", " ".join(capsys.readouterr().out.split()))
+    shutil.rmtree(first)
+    # It may be seen by another path.
+    moved.rename(first)
+    assert opened(volumes={}).folder == first
+    assert capsys.readouterr().out == ""
