@@ -24,7 +24,7 @@ from armscan.experiment.runner import run_tracked
 from armscan.tracking import TrackedRun, TrackingStore, check_version, sync
 from armscan.tracking.tags import FOLDER_TAG, HOST_TAG, OWN_CODE_TAG, STUDY_TAG, WORKING_FOLDER_TAG
 from armscan.training import Fingerprints, check_unchanged, fingerprints_in, resume_from_checkpoint
-from armscan.utils.files import remove_unfinished, sha256
+from armscan.utils.files import NAMED_PIPE, remove_unfinished, sha256
 from armscan.utils.run_files import (
     CONFIG_FILE,
     LAST_CHECKPOINT,
@@ -116,6 +116,8 @@ def _config_of(run: Run, folder: Path) -> dict[str, Any]:
 
 def _started_with(run: Run, file: Path, what: str) -> bytes:
     """Return the contents of a file that a run was started with."""
+    if file.is_fifo():
+        raise ResumeError(f"{file}: {NAMED_PIPE}")
     try:
         contents = file.read_bytes()
     except OSError as error:

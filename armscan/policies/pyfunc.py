@@ -1,5 +1,6 @@
 """MLflow model of a policy: a stand-alone file, stored in the model, that does not import armscan."""
 
+import zipfile
 from typing import Any
 
 import mlflow
@@ -13,8 +14,13 @@ class PyfuncPolicy(PythonModel):
     """A batch of observations in, shape (n, k), or each part by its name, shape (n, ...); actions out."""
 
     def load_context(self, context: PythonModelContext) -> None:
-        """Read the policy's program."""
-        self._policy = torch.export.load(context.artifacts["program"]).module()
+        """Read the policy's program; raise `ValueError` if it is damaged, which torch does not notice."""
+        path = context.artifacts["program"]
+        with zipfile.ZipFile(path) as program:
+            damaged = program.testzip()
+        if damaged is not None:
+            raise ValueError(f"{path}: the policy is damaged, in {damaged}")
+        self._policy = torch.export.load(path).module()
 
     def predict(
         self,

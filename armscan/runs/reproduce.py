@@ -84,7 +84,7 @@ def _environment(text: str, run: FoundRun) -> Mapping[str, Any]:
     try:
         kept = json.loads(text)
         return dict(kept) | {"packages": dict(kept["packages"])}
-    except (ValueError, TypeError, KeyError) as error:
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
         raise TrackingError(f"run {run.run_id}: its {ENVIRONMENT_FILE} is damaged, or another file") from error
 
 

@@ -125,7 +125,7 @@ class OutboxFile:
     def _read(self, line: bytes) -> Entry:
         try:
             entry = json.loads(line)
-        except ValueError:
+        except (ValueError, RecursionError):
             entry = None
         if not isinstance(entry, dict):
             raise TrackingError(f"{self.file}: a line is damaged: {line[:50]!r}")

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, cast
 
 from armscan.errors import CheckpointError
-from armscan.utils.files import atomic_write
+from armscan.utils.files import NAMED_PIPE, atomic_write
 
 if TYPE_CHECKING:
     import torch
@@ -58,6 +58,8 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     """
     import torch
 
+    if path.is_fifo():
+        raise CheckpointError(f"{path}: {NAMED_PIPE}")
     try:
         with path.open("rb") as file:
             contents = _verified(file, path)

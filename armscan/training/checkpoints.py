@@ -143,10 +143,15 @@ def _restore(learner: Learner, last: Path, provenance: CheckpointProvenance) -> 
     try:
         learner.load_state(state)
     # The checksum is right, so the state was written with other contents.
-    except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, RuntimeError, AssertionError, OverflowError) as error:
         if isinstance(error, CheckpointError):
             raise
         raise CheckpointError(f"{last}: does not hold the state of this agent: {error!r}") from error
+    if learner.n_env_steps != reports[-1].n_env_steps:
+        raise CheckpointError(
+            f"{last}: the agent has taken {learner.n_env_steps} environment steps, but its last epoch reports "
+            f"{reports[-1].n_env_steps}"
+        )
     return reports
 
 
@@ -178,6 +183,6 @@ def _read(text: Any, path: Path) -> list[EpochReport]:
             reports.append(EpochReport(**record, evaluation=evaluation))
         # One of them is the best.
         next(report for report in reports if report.is_best)
-    except (TypeError, ValueError, KeyError, AttributeError, StopIteration) as error:
+    except (TypeError, ValueError, KeyError, AttributeError, StopIteration, RecursionError) as error:
         raise CheckpointError(f"{path}: holds no reports of the epochs so far, which resuming needs") from error
     return reports

@@ -9,7 +9,7 @@ from itertools import islice
 import numpy as np
 
 from armscan.errors import InvalidValueError, listed
-from armscan.utils.text import in_other_form
+from armscan.utils.text import looks_like_one_of
 from armscan.utils.validation import check_float, check_int, check_seed
 from armscan.volumes import Dataset
 
@@ -136,7 +136,7 @@ def _named(dataset: Dataset, names: Sequence[str], part: str, path: str) -> list
     if not all(isinstance(name, str) for name in names):
         raise InvalidValueError(f"data.{part} is {names!r}, but it must be a share, or names of subjects or volumes")
     if unknown := [name for name in names if name not in known]:
-        hint = ", in other Unicode forms" if any(in_other_form(name, known) for name in unknown) else ""
+        hint = ", which look alike" if any(looks_like_one_of(name, known) for name in unknown) else ""
         raise InvalidValueError(
             f"data.{part} names {listed(unknown)}, but {path} holds {listed(dict.fromkeys(known))}{hint}"
         )

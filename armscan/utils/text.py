@@ -37,11 +37,14 @@ def counted(number: int, what: str) -> str:
     return f"{number} {what}{'' if number == 1 else 's'}"
 
 
-def in_other_form(name: str, known: Iterable[str]) -> bool:
-    """Return whether a name is among others in another Unicode form, such as that of file names copied from a Mac."""
-    return any(
-        name != each and unicodedata.normalize("NFC", name) == unicodedata.normalize("NFC", each) for each in known
-    )
+def appearance(name: str) -> str:
+    """Return a name without invisible characters, and in one Unicode form: names copied from a Mac have another."""
+    return "".join(each for each in unicodedata.normalize("NFKC", name) if unicodedata.category(each) != "Cf")
+
+
+def looks_like_one_of(name: str, known: Iterable[str]) -> bool:
+    """Return whether a name looks like another one."""
+    return any(name != each and appearance(name) == appearance(each) for each in known)
 
 
 def markdown_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -30,6 +30,11 @@ METAIMAGE_TYPES = {
     "MET_DOUBLE": 8,
 }
 METAIMAGE_FIELDS = ("NDims", "DimSize", "ElementType", "ElementDataFile")
+# Fields of one meaning; SimpleITK uses one of them.
+POSITIONS, DIRECTIONS = ("Offset", "Position", "Origin"), ("TransformMatrix", "Rotation", "Orientation")
+SPACINGS = ("ElementSpacing", "ElementSize")
+# Of an axis of an NRRD file.
+DIRECTION = r"\(([^()]*)\)|(none)"
 # Without `signed`, `unsigned` and the suffix `_t`.
 NRRD_TYPES = {"char": 1, "uchar": 1, "int8": 1, "uint8": 1, "short": 2, "short int": 2, "ushort": 2, "int16": 2}
 NRRD_TYPES |= {"uint16": 2, "int": 4, "uint": 4, "int32": 4, "uint32": 4, "longlong": 8, "long long": 8}
@@ -108,13 +113,18 @@ def check_metaimage(path: Path) -> None:
         raise VolumeError(f"{path}: the header is damaged: each line must be a field of its own, with a value")
     if missing := [name for name in METAIMAGE_FIELDS if name not in fields]:
         raise VolumeError(f"{path}: the header gives no {missing[0]}, but a MetaImage needs it")
+    _check_n_numbers(path, fields)
     spacing = fields.get("ElementSpacing", fields.get("ElementSize"))
     if spacing is None:
         raise VolumeError(f"{path}: the file gives no spacing (ElementSpacing), but a volume needs one")
     check_spacing(path, [_number(word) for word in spacing.split()])
     _check_units(path, "DistanceUnits", [fields.get("DistanceUnits", "")])
-    for name in ("Offset", "Position", "Origin"):
+    for name in POSITIONS:
         _check_finite(path, name, fields, fields.get(name, "").split())
+    for names in (POSITIONS, DIRECTIONS):
+        stated = {name: [_number(word) for word in fields[name].split()] for name in names if name in fields}
+        if any(numbers != next(iter(stated.values())) for numbers in stated.values()):
+            raise VolumeError(f"{path}: {listed(stated)} differ, but only one of them is used: remove the wrong one")
     sizes = [_whole(path, "DimSize", word) for word in fields["DimSize"].split()]
     kind = fields["ElementType"]
     if kind not in METAIMAGE_TYPES or fields["NDims"] != str(len(sizes)):
@@ -175,11 +185,26 @@ def _fields(path: Path, header: bytes, separator: str) -> dict[str, str]:
     return {line[0].strip(): line[1].strip() for line in reversed(lines) if len(line) == 2}
 
 
+def _check_n_numbers(path: Path, fields: Mapping[str, str]) -> None:
+    """Raise `VolumeError` if a field of a MetaImage has too few numbers: the rest would be taken from the next line."""
+    n_dimensions = _whole(path, "NDims", fields["NDims"])
+    counts = dict.fromkeys((*SPACINGS, *POSITIONS, "CenterOfRotation"), n_dimensions)
+    counts |= dict.fromkeys(DIRECTIONS, n_dimensions**2) | {"Color": 4, "ElementMin": 1, "ElementMax": 1}
+    for name, count in counts.items():
+        if name in fields and len(fields[name].split()) != count:
+            raise VolumeError(f"{path}: {name} is {fields[name]!r}, but it must be {count} numbers")
+
+
 def _check_nrrd_spacing(path: Path, fields: dict[str, str]) -> None:
     if "spacings" in fields:
         check_spacing(path, [_number(word) for word in fields["spacings"].split()])
     elif "space directions" in fields:
-        vectors = re.findall(r"\(([^)]*)\)|(none)", fields["space directions"])
+        directions = fields["space directions"]
+        vectors = re.findall(DIRECTION, directions)
+        if not vectors or re.sub(DIRECTION, "", directions).strip():
+            raise VolumeError(
+                f"{path}: space directions is {directions[:40]!r}, but it must be vectors such as (1,0,0), or none"
+            )
         # The layer axis of a segmentation has no direction; a spatial axis must have one.
         if len(vectors) > 3 and vectors[0][1]:
             vectors = vectors[1:]

@@ -18,7 +18,7 @@ from yaml.representer import SafeRepresenter
 from armscan.errors import InvalidValueError, ManifestError, VolumeError, few, listed, reason_of
 from armscan.utils.files import atomic_write, cache_folder, sha256
 from armscan.utils.strict_yaml import check_no_duplicates, load_yaml
-from armscan.utils.text import in_other_form
+from armscan.utils.text import looks_like_one_of
 from armscan.utils.validation import check_float, check_path
 from armscan.volumes.header_checks import CHECKS
 from armscan.volumes.plane import ManipulatorAction
@@ -83,7 +83,7 @@ def volume_entries(manifest: Manifest, files: Mapping[str, Path], path: Path | N
 
     if manifest.volumes is None:
         return {name: VolumeEntry() for name in files}
-    if lookalikes := [name for name in manifest.volumes if name not in files and in_other_form(name, files)]:
+    if lookalikes := [name for name in manifest.volumes if name not in files and looks_like_one_of(name, files)]:
         raise ManifestError(
             f"{path}: has an entry for {few(lookalikes)}, which the folder holds in another Unicode form, with accents "
             "joined to their letters or apart: copy the name from the folder"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import reprlib
-import unicodedata
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -12,6 +11,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, Validati
 
 from armscan.errors import InvalidValueError, ManifestError, listed, printable
 from armscan.utils.section import Section
+from armscan.utils.text import appearance
 from armscan.utils.validation import check_float, check_numbers
 from armscan.volumes.labelmap import LabelMap
 from armscan.volumes.orientation import Crop, check_axes, check_crop, check_orientation
@@ -32,6 +32,12 @@ def _named(text: str) -> str:
     if text != text.strip():
         raise InvalidValueError(f"is {text!r}, but a subject must not begin or end with a blank")
     return _printable(text)
+
+
+def _reason(text: str) -> str:
+    if text.lower() in ("n", "no", "off", "false", "y", "yes", "on", "true"):
+        raise InvalidValueError(f"exclude is the string {text!r}, but it must be true, false or the reason")
+    return text
 
 
 def _subjects(value: Any) -> tuple[str, ...]:
@@ -59,6 +65,7 @@ Translation = Annotated[
 ]
 Score = Annotated[float, BeforeValidator(partial(check_float, "score", at_least=-1.0, at_most=0.0))]
 Text = Annotated[str, AfterValidator(_printable)]
+Reason = Annotated[Text, Field(min_length=1), AfterValidator(_reason)]
 Subject = Annotated[str, AfterValidator(_named)]
 Axes = Annotated[str, BeforeValidator(check_axes)]
 Orientation = Annotated[str | None, BeforeValidator(check_orientation)]
@@ -84,7 +91,7 @@ class VolumeEntry(_Settings):
     subject: Subject | None = Field(
         default=None, min_length=1, description="a string that is not empty (quote numbers)"
     )
-    exclude: bool | Annotated[Text, Field(min_length=1)] = Field(default=False, description="true, false or the reason")
+    exclude: bool | Reason = Field(default=False, description="true, false or the reason")
     crop_mm: Annotated[Crop | None, BeforeValidator(check_crop)] = None
 
     @model_validator(mode="after")
@@ -132,8 +139,8 @@ class Manifest(_Settings):
         names = [entry.subject for entry in (self.volumes or {}).values() if entry.subject is not None]
         first: dict[str, str] = {}
         for name in names:
-            if first.setdefault(unicodedata.normalize("NFC", name), name) != name:
-                raise InvalidValueError(f"has two spellings of the subject {name!r}, in different Unicode forms")
+            if (other := first.setdefault(appearance(name), name)) != name:
+                raise InvalidValueError(f"has two spellings of a subject that look alike: {other!a}, {name!a}")
         return self
 
     def setting(self, entry: VolumeEntry, key: str) -> Any:

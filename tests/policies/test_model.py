@@ -2,10 +2,12 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import urllib.request
+import zipfile
 from functools import partial
 from pathlib import Path
 
@@ -285,6 +287,21 @@ def test_model_refuses_observations_that_give_no_finite_action(made, value):
     model = mlflow.pyfunc.load_model(str(folder / "model"))
     with np.errstate(over="ignore"), pytest.raises(ValueError, match="actions that are not finite"):
         model.predict(np.full_like(arrays, value))
+
+
+def test_model_with_a_damaged_weight_is_refused(made, tmp_path):
+    import mlflow.pyfunc
+
+    shutil.copytree(made["sac", "vector"][0] / "model", tmp_path / "model")
+    program = tmp_path / "model" / "artifacts" / "policy.pt2"
+    with zipfile.ZipFile(program) as archive:
+        (weight, *_) = [each for each in archive.infolist() if "/weights/weight_" in each.filename]
+    contents = bytearray(program.read_bytes())
+    # After the entry's own header, whose name and padding are shorter than this.
+    contents[weight.header_offset + weight.file_size] ^= 1
+    program.write_bytes(contents)
+    with pytest.raises(ValueError, match=r"policy\.pt2: the policy is damaged, in .*/weights/weight_"):
+        mlflow.pyfunc.load_model(str(tmp_path / "model"))
 
 
 def test_model_takes_memory_that_may_not_be_written_to(made):

@@ -3,6 +3,7 @@
 import hashlib
 import io
 import json
+import os
 import pickle
 
 import pytest
@@ -84,6 +85,12 @@ def test_other_files_are_no_checkpoints(tmp_path):
             load_checkpoint(tmp_path / f"{name}.pt")
 
 
+def test_named_pipe_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "a.pt")
+    with pytest.raises(CheckpointError, match=r"a\.pt: is a named pipe"):
+        load_checkpoint(tmp_path / "a.pt")
+
+
 def test_missing_checkpoint_is_named(tmp_path):
     with pytest.raises(CheckpointError, match=r"a\.pt: there is no such checkpoint"):
         load_checkpoint(tmp_path / "a.pt")
@@ -120,17 +127,26 @@ def test_checkpoint_that_holds_something_else_is_refused(tmp_path, content):
         load_checkpoint(tmp_path / "a.pt")
 
 
-@pytest.mark.parametrize("error", [KeyError("replay"), TypeError("3"), AttributeError("numpy"), RuntimeError("shape")])
-def test_state_that_no_learner_takes_is_refused(tmp_path, error):
+ERRORS = KeyError("replay"), TypeError("3"), AttributeError("numpy"), RuntimeError("shape"), AssertionError("rows")
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [*((error, "does not hold the state of this agent: ") for error in ERRORS), (None, "has taken 8 .* reports 7")],
+)
+def test_state_that_no_learner_takes_is_refused(tmp_path, error, message):
     class Learner:
+        n_env_steps = 8
+
         def load_state(self, state):
-            raise error
+            if error is not None:
+                raise error
 
     report = {"epoch": 1, "n_env_steps": 7, "wall_s": 1.0, "metrics": {}, "is_best": True}
     reports = json.dumps([report | {"episodes": {name: [] for name in EPISODE_FIELDS}}])
     facts = CheckpointProvenance().facts() | {"reports": reports}
     save_checkpoint(tmp_path / "last.pt", {}, facts)
-    with pytest.raises(CheckpointError, match=r"last\.pt: does not hold the state of this agent: "):
+    with pytest.raises(CheckpointError, match=rf"last\.pt: .*{message}"):
         resume_from_checkpoint(Learner(), tmp_path, CheckpointProvenance())
     save_checkpoint(tmp_path / "last.pt", {}, facts | {"volumes": [3]})
     with pytest.raises(ChangedVolumesError, match=r"last\.pt: is not a record of volumes"):

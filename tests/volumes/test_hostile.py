@@ -28,14 +28,14 @@ NRRD = (
 )
 
 
-def nifti(n, begin=352.0, magic=b"n+1\0", place=1.0, qform=None):
+def nifti(n, begin=352.0, magic=b"n+1\0", place=1.0, qform=None, scaling=(0.0, 0.0)):
     """Return the header of a NIfTI file of n x n x n bytes."""
     header = bytearray(352)
     struct.pack_into("<i", header, 0, 348)
     struct.pack_into("<8h", header, 40, 3, n, n, n, 1, 1, 1, 1)
     struct.pack_into("<2h", header, 70, 2, 8)
     struct.pack_into("<8f", header, 76, *[1.0] * 8)
-    struct.pack_into("<f", header, 108, begin)
+    struct.pack_into("<3f", header, 108, begin, *scaling)
     struct.pack_into("<12f", header, 280, *[place, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0])
     struct.pack_into("<6f", header, 256, *qform or [0.0] * 6)
     struct.pack_into("<2h", header, 252, qform is not None, 1)
@@ -150,6 +150,14 @@ VOXELS = np.ascontiguousarray(make_tiny_volume().labels[:10, :10, :10].T).tobyte
         (nifti(10, qform=(0, 0, 0.1, 0, 0, 0)), "qform and sform state directions that differ by up to 11.5°"),
         (nifti(10, qform=(0, 0, 1, 0, 0, 0)), "qform and sform state directions that differ by up to 180°"),
         (nifti(10, qform=(0, 0, 0, 0.2, 0, 0)), "state the origins (0.2, 0, 0) and (0, 0, 0), which may differ by 0.1"),
+        (nifti(10, scaling=(2.0, 0.0)), "its voxels are scaled: scl_slope is 2"),
+        (
+            nifti(10, scaling=(0.0, 1.0)),
+            "its voxels are scaled: scl_slope is 0, but must be 0 or 1, and scl_inter is 1",
+        ),
+        (nifti(10, scaling=(-1.0, 3.0)), "its voxels are scaled: scl_slope is -1"),
+        (nifti(10, scaling=(float("nan"), 1.0)), "its voxels are scaled: scl_slope is nan"),
+        (nifti(10, scaling=(1.0, float("inf"))), "its voxels are scaled: scl_slope is 1"),
         (struct.pack("<i", 540) + nifti(10)[4:], "the file is NIfTI-2, but NIfTI-1 is read"),
         (nifti(10, place=1.01), "the spacing is (1, 1, 1) by pixdim, but (1.01, 1, 1) by the sform"),
         (nifti(10, place=-0.99), "the spacing is (1, 1, 1) by pixdim, but (0.99, 1, 1) by the sform"),
@@ -159,6 +167,48 @@ VOXELS = np.ascontiguousarray(make_tiny_volume().labels[:10, :10, :10].T).tobyte
 def test_nifti_headers_that_would_be_mended_or_printed_about_are_refused(refusal, name, header, message):
     contents = header + VOXELS
     assert message in refusal(name, gzip.compress(contents) if name.endswith("gz") else contents)
+
+
+@pytest.mark.parametrize("scaling", [(0.0, 0.0), (1.0, 0.0), (float("nan"), float("nan")), (0.0, float("nan"))])
+def test_nifti_without_scaling_is_read_however_it_says_so(tmp_path, scaling):
+    voxels = np.arange(1000, dtype=np.uint8) % 4
+    voxels[0] = 3
+    (tmp_path / "a.nii").write_bytes(nifti(10, scaling=scaling) + voxels.tobytes())
+    np.testing.assert_array_equal(np.bincount(read_volume(tmp_path / "a.nii").labels.ravel()), np.bincount(voxels))
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"Offset = 5",
+        b"Offset = 0 000",
+        b"CenterOfRotation = 0 000",
+        b"TransformMatrix = 1 0 0 0 1 0 0 0",
+        b"Color = 1 0 0",
+        b"ElementMin =",
+    ],
+)
+def test_metaimage_field_that_would_swallow_the_spacing_is_refused(refusal, line):
+    contents = mha(10, VOXELS).replace(b"ElementSpacing", line + b"\nElementSpacing")
+    name, _, value = line.decode().partition(" =")
+    assert f"a.mha: {name} is {value.strip()!r}, but it must be " in refusal("a.mha", contents)
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        b"Offset = 0 0 0\nPosition = 0 0 5",
+        b"TransformMatrix = 1 0 0 0 1 0 0 0 1\nOrientation = 0 1 0 1 0 0 0 0 1",
+    ],
+)
+def test_metaimage_that_contradicts_itself_is_refused(refusal, lines):
+    contents = mha(10, VOXELS).replace(b"ElementSpacing", lines + b"\nElementSpacing")
+    assert "differ, but only one of them is used: remove the wrong one" in refusal("a.mha", contents)
+
+
+def test_nrrd_of_open_brackets_is_refused_at_once(refusal):
+    contents = nrrd(10, VOXELS).replace(b"(1,0,0) (0,1,0) (0,0,1)", b"(" * 500_000)
+    assert "space directions is '((((" in refusal("a.nrrd", contents)
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,9 @@ def test_manifest_without_entries_takes_every_volume(folder):
     ("subjects", "message"),
     [
         (("S1 ", "S1"), "is 'S1 ', but a subject must not begin or end with a blank"),
-        (("Mu\u0308ller", "M\u00fcller"), "has two spellings of the subject 'M\u00fcller'"),
+        (("Mu\u0308ller", "M\u00fcller"), r"look alike: 'Mu\\u0308ller', 'M\\xfcller'"),
+        (("S 1", "S\u00a01"), r"look alike: 'S 1', 'S\\xa01'"),
+        (("S1", "S1\u200b"), r"look alike: 'S1', 'S1\\u200b'"),
     ],
 )
 def test_manifest_refuses_subjects_that_look_alike(folder, subjects, message):
@@ -160,6 +162,11 @@ def test_manifest_refuses_impossible_splits(folder, splits, message):
         ("volumes: {a.nii.gz: {subject: 3}}", "entry 'a.nii.gz': subject is 3, but it must be a string"),
         ("volumes: {a.nii.gz: {subject: ''}}", "entry 'a.nii.gz': subject is '', but it must be a string"),
         ("volumes: {a.nii.gz: {exclude: 1}}", "entry 'a.nii.gz': exclude is 1, but it must be true, false or the"),
+        (
+            "volumes: {a.nii.gz: {exclude: 'no'}}",
+            "entry 'a.nii.gz': exclude is 'no', but it must be true, false or the",
+        ),
+        ("volumes: {a.nii.gz: {exclude: n}}", "entry 'a.nii.gz': exclude is 'n', but it must be true, false or the"),
         ("volumes: {a.nii.gz: {exclude: ''}}", "entry 'a.nii.gz': exclude is '', but it must be true, false or the"),
         ("? ''\n: 1\n? ''\n: 2", "the key '' appears twice"),
         ("volumes: {a.nii.gz: {score: 0.1}}", "entry 'a.nii.gz': score is 0.1, but it must be"),
