@@ -29,6 +29,8 @@ OUTSIDE = re.compile(r"\.\.|(?<![\w-])/")
 OBJECT_STORES = ("s3", "gs", "wasbs")
 # Functions that may write phantoms.
 OF_DATA = tuple(f"armscan.training.{name}_data" for name in ("phantom", "nifti", "mixed"))
+# Keys of Hydra that armscan's configuration does not use.
+UNUSED = frozenset({"_args_", "_partial_", "_convert_", "_recursive_"})
 AMBIGUOUS = frozenset("\\ ")
 WITHOUT_PASSWORD = (*OBJECT_STORES, "", "file")
 # Of grids and studies; the configuration of a run names none of their classes.
@@ -79,8 +81,8 @@ def _misplaced_part(config: Mapping[str, Any]) -> str | None:
     """
     for key, value in _leaves(config):
         parts = key.split(".")
-        if "_args_" in parts:
-            return f"has {key}, but armscan's classes are given arguments by name"
+        if not UNUSED.isdisjoint(parts):
+            return f"has {key}, but armscan's classes are given arguments by name, and nothing else"
         is_of_data = parts[-1] == "cache_dir" or (parts[-1] == TARGET and value in OF_DATA)
         if is_of_data and parts[:-1] != ["data"]:
             return f"has {key}={value!r}, but this is allowed only in the section data"

@@ -66,13 +66,14 @@ def test_class_of_others_is_refused_at_every_place(data, target):
         {"env.observation.0.cache_dir": "/tmp"},
         {"data._args_": [1, 1, 1, 0, "/tmp"]},
         {"env._args_": []},
+        {"data._partial_": True},
     ],
 )
 def test_stored_configuration_writes_phantoms_into_no_folder(changes):
     config = OmegaConf.create(default_config())
     for key, value in changes.items():
         OmegaConf.update(config, key, value, force_add=True)
-    with pytest.raises(UntrustedError, match=r"run 1: its configuration has .*_args_|only in the section data"):
+    with pytest.raises(UntrustedError, match=r"run 1: its configuration has .*_(args|partial)_|only in the section data"):
         stored_config(to_plain(config), where="run 1", trust=False)
     assert stored_config(default_config(), where="run 1", trust=False)["data"]["cache_dir"] is None
 
