@@ -213,7 +213,7 @@ def test_server_that_only_a_folder_names_is_sent_nothing(armscan, tmp_path, monk
     assert not opened
     # A stranger's outbox does not decide which stores are this user's.
     with contextlib.closing(Outbox(outbox.file)) as mine:
-        mine.note("sqlite:///mlruns.db")
+        mine.mark_pending("sqlite:///mlruns.db")
     assert "is not a store that this user has used here" in armscan("runs", "sync", "theirs")[1]
     assert not opened
 

@@ -73,7 +73,7 @@ def test_stored_configuration_writes_phantoms_into_no_folder(changes):
     config = OmegaConf.create(default_config())
     for key, value in changes.items():
         OmegaConf.update(config, key, value, force_add=True)
-    with pytest.raises(UntrustedError, match=r"run 1: its configuration has .*_(args|partial)_|only in the section data"):
+    with pytest.raises(UntrustedError, match=r"run 1: its configuration has .*_(args|partial)_|only in the section"):
         stored_config(to_plain(config), where="run 1", trust=False)
     assert stored_config(default_config(), where="run 1", trust=False)["data"]["cache_dir"] is None
 
