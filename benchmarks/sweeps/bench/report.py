@@ -103,7 +103,7 @@ def _print_power(name: str, residuals: FloatArray) -> None:
     needed = needed_seeds(power)
     rows = [
         # Rounded down, so that no share below 80 % reads as 80 %.
-        (f"{difference:.0%}", *(f"{floor(100 * share)}%" for share in row), needed.get(float(difference), "") or "none")
+        (f"{difference:.0%}", *(floor(100 * share) for share in row), needed.get(float(difference), "") or "none")
         for difference, row in power.iterrows()
     ]
     print(f"\nNoise between seeds of {name}: {100 * residuals.std():.0f} % of the steps")
