@@ -7,7 +7,7 @@ import os
 from armscan.utils.processes import (
     collect_garbage_rarely,
     discard_output,
-    interruptions,
+    end_like_ctrl_c,
     limit_threads,
     no_garbage_collection,
 )
@@ -18,7 +18,6 @@ collect_garbage_rarely()
 # that is asked to end, and prints a stack trace.
 os.environ.setdefault("RAY_DISABLE_FAILURE_SIGNAL_HANDLER", "1")
 
-import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -121,10 +120,8 @@ def main() -> int:
         os.environ[TRACEBACKS] = "1"
     # Makes Hydra raise its errors, so that they are reported here.
     os.environ["HYDRA_FULL_ERROR"] = "1"
-    # All like Ctrl-C, which Python handles: the run is closed as KILLED in the tracking store.
-    for each in interruptions():
-        if each != signal.SIGINT:
-            signal.signal(each, signal.default_int_handler)
+    # The run is closed as KILLED in the tracking store.
+    end_like_ctrl_c()
     silence_libraries()
     # Hydra reads its options only before the first override, but users type them anywhere.
     sys.argv[1:] = sorted(sys.argv[1:], key=lambda each: each not in MULTIRUN)

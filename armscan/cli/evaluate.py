@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,6 +21,7 @@ from armscan.config.defaults import CHANGES, default_tracking
 from armscan.errors import InvalidValueError
 from armscan.stats.on_plane import ON_PLANE_KEY
 from armscan.utils.console import wide_console
+from armscan.utils.processes import end_like_ctrl_c
 from armscan.utils.validation import MAX_SEED
 
 if TYPE_CHECKING:
@@ -118,7 +118,7 @@ def evaluate(
     docs/seeing.md the video.
     """
     # As in `armscan run`: the evaluation's run is closed as KILLED.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    end_like_ctrl_c()
     changes = {name: value for name, value in rules.items() if value is not None}
     _check_arguments(run, agent, data, changes)
     _check_options(agent, data, tracking_experiment, video=video)

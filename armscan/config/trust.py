@@ -82,7 +82,7 @@ def _misplaced_part(config: Mapping[str, Any]) -> str | None:
     for key, value in _leaves(config):
         parts = key.split(".")
         if not UNUSED.isdisjoint(parts):
-            return f"has {key}, but armscan's classes are given arguments by name, and nothing else"
+            return f"has {key}, which armscan's own configuration uses nowhere"
         is_of_data = parts[-1] == "cache_dir" or (parts[-1] == TARGET and value in OF_DATA)
         if is_of_data and parts[:-1] != ["data"]:
             return f"has {key}={value!r}, but this is allowed only in the section data"

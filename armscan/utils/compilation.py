@@ -17,6 +17,7 @@ from filelock import FileLock
 from numba.core.event import Event, Listener, install_listener
 
 from armscan.utils.log import log
+from armscan.utils.processes import interruptions
 
 PACKAGE = Path(__file__).parents[1]
 LOCK_FILE = ".lock"
@@ -101,7 +102,7 @@ class _Note(Listener):
 
 
 class _DeferredSignals(Listener):
-    """Defers Ctrl-C and SIGTERM until a function is compiled: LLVM's callbacks lose exceptions, and compiling fails.
+    """Defers Ctrl-C, and signals like it, during a compilation: LLVM's callbacks lose exceptions, and compiling fails.
 
     A second signal is handled at once.
     """
@@ -115,7 +116,7 @@ class _DeferredSignals(Listener):
         if current_thread() is not main_thread():
             return
         if self._depth == 0:
-            found = {each: signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)}
+            found = {each: signal.getsignal(each) for each in interruptions()}
             self._handlers = {number: handler for number, handler in found.items() if callable(handler)}
             for number in self._handlers:
                 signal.signal(number, self._receive)

@@ -21,9 +21,9 @@ from armscan.errors import with_causes
 UNFINISHED = "unfinished"
 # The disk is full, or the user's quota is.
 FULL_DISK = (errno.ENOSPC, errno.EDQUOT)
-# Names of the folders of installed packages.
 # Why such a file is not opened.
 NAMED_PIPE = "is a named pipe, which is never read, because that would wait for its writer"
+# Names of the folders of installed packages.
 PACKAGE_FOLDERS = frozenset({"site-packages", "dist-packages"})
 # Prefix of the address of a database in a file.
 SQLITE_PREFIX = "sqlite:///"

@@ -63,6 +63,13 @@ def interruptions() -> list[signal.Signals]:
     return [signal.SIGINT, signal.SIGTERM, *closed]
 
 
+def end_like_ctrl_c() -> None:
+    """End this process like Ctrl-C, which Python handles itself, when it is told to end or its terminal is closed."""
+    for each in interruptions():
+        if each != signal.SIGINT:
+            signal.signal(each, signal.default_int_handler)
+
+
 @contextmanager
 def no_garbage_collection() -> Iterator[None]:
     """Collect no garbage inside the context, while permanent objects are made, and never scan these again."""

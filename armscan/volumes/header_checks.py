@@ -186,10 +186,12 @@ def _fields(path: Path, header: bytes, separator: str) -> dict[str, str]:
 
 
 def _check_n_numbers(path: Path, fields: Mapping[str, str]) -> None:
-    """Raise `VolumeError` if a field of a MetaImage has too few numbers: the rest would be taken from the next line."""
+    """Raise `VolumeError` if a field of a MetaImage has another number of numbers: SimpleITK would read on."""
     n_dimensions = _whole(path, "NDims", fields["NDims"])
     counts = dict.fromkeys((*SPACINGS, *POSITIONS, "CenterOfRotation"), n_dimensions)
-    counts |= dict.fromkeys(DIRECTIONS, n_dimensions**2) | {"Color": 4, "ElementMin": 1, "ElementMax": 1}
+    counts |= dict.fromkeys(DIRECTIONS, n_dimensions**2) | {"Color": 4}
+    counts |= dict.fromkeys(("ElementMin", "ElementMax"), 1)
+    counts |= dict.fromkeys(("ElementToIntensityFunctionSlope", "ElementToIntensityFunctionOffset"), 1)
     for name, count in counts.items():
         if name in fields and len(fields[name].split()) != count:
             raise VolumeError(f"{path}: {name} is {fields[name]!r}, but it must be {count} numbers")

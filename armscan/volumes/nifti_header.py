@@ -57,12 +57,12 @@ def check_nifti(path: Path) -> None:
             f"{path}: has {n_dimensions} dimensions and voxels of type {datatype}, but a labelmap has 3, and integers "
             "or floats"
         )
-    # SimpleITK applies them, so that the values are no labels; some programs write NaN for none.
+    # SimpleITK applies them to the labels; some programs write NaN for none.
     slope, inter = fields["scl"]
     if (slope not in (0.0, 1.0) and not math.isnan(slope)) or (inter != 0.0 and not math.isnan(inter)):
         raise VolumeError(
             f"{path}: its voxels are scaled: scl_slope is {slope:g}, but must be 0 or 1, and scl_inter is {inter:g}, "
-            "but must be 0: save the labels themselves"
+            "but must be 0: save the labels unscaled"
         )
     # The spacings of unused axes are often 0 and mean nothing.
     check_spacing(path, fields["pixdim"][1:4][:n_dimensions])

@@ -12,12 +12,13 @@ import pytest
 from armscan.experiment import runner
 from armscan.experiment.job import Invocation, Job
 from armscan.launch import job_process
+from armscan.utils.processes import interruptions
 
 
 @pytest.fixture
 def handlers():
     """Restore the signal handlers that a job sets in its process."""
-    before = {each: signal.getsignal(each) for each in job_process.ENDINGS}
+    before = {each: signal.getsignal(each) for each in interruptions()}
     yield
     for each, handler in before.items():
         signal.signal(each, handler)

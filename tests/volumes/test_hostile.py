@@ -186,6 +186,7 @@ def test_nifti_without_scaling_is_read_however_it_says_so(tmp_path, scaling):
         b"TransformMatrix = 1 0 0 0 1 0 0 0",
         b"Color = 1 0 0",
         b"ElementMin =",
+        b"ElementToIntensityFunctionSlope =",
     ],
 )
 def test_metaimage_field_that_would_swallow_the_spacing_is_refused(refusal, line):

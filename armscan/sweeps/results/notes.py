@@ -29,4 +29,5 @@ def code_notes(study: optuna.Study, what: str) -> list[str]:
     if len({code.rpartition(" ")[2] for code in known}) < 2:
         return []
     counts = ", ".join(f"{code}: {n_trials}" for code, n_trials in known.items())
-    return [f"{what} ran different versions of armscan's code ({counts}), so their values may not compare"]
+    versions = f"different versions of armscan's code (commit, checksum: trials; {counts})"
+    return [f"{what} had {versions}; their values may differ"]

@@ -40,8 +40,8 @@ from armscan.utils.files import atomic_write
 from armscan.utils.retry import RETRY_S
 
 NO_END = 10**9
-# In the folder of a study: its name, and in a second line the folder that it was begun in, with a random ID.
-OWNER_FILE = "study_name"
+# In the folder of a study: its name, and the folder that it was begun in, with a random ID.
+OWNER_FILE, ORIGIN_FILE = "study_name", "begun_in"
 
 
 def open_for_work(
@@ -116,7 +116,7 @@ def _claim_folder(folder: Path, study: optuna.Study) -> None:
         # Earlier versions wrote no name.
         is_known = folder.name == name or not (folder / "trials").exists() or bool(study.get_trials(deepcopy=False))
         atomic_write(file, name if is_known else "another study")
-    if (owner := file.read_text().partition("\n")[0].strip()) != name:
+    if (owner := file.read_text().strip()) != name:
         raise StudyError(
             f"study.folder is {str(folder)!r}, which has the files of {owner}: give study.folder another value"
         )
@@ -124,29 +124,36 @@ def _claim_folder(folder: Path, study: optuna.Study) -> None:
 
 def _begun_in(folder: Path, study: optuna.Study, storage: Storage) -> tuple[str, bool]:
     """Return the folder that a study was begun in, with its machine, and whether this is it, seen from anywhere."""
-    file = folder / OWNER_FILE
-    of_folder = file.read_text().partition("\n")[2].strip()
+    file = folder / ORIGIN_FILE
 
-    def of_study() -> str:
-        if BEGUN_IN not in study.user_attrs:
-            begun_in = of_folder or f"{socket.gethostname()}:{folder.absolute()} {uuid4().hex[:8]}"
-            atomic_write(file, f"{study.study_name}\n{begun_in}\n")
-            study.set_user_attr(BEGUN_IN, begun_in)
-        return str(study.user_attrs[BEGUN_IN])
+    def origins() -> tuple[str, str]:
+        """Return where the study was begun, and what this folder says."""
+        here = file.read_text().strip() if file.exists() else ""
+        if BEGUN_IN in study.user_attrs:
+            return str(study.user_attrs[BEGUN_IN]), here
+        # A study of an earlier version, which has its trials elsewhere or keeps no files of them: nothing is known.
+        if study.get_trials(deepcopy=False) and not (folder / "trials").exists():
+            return here, here
+        here = here or f"{socket.gethostname()}:{folder.absolute()} {uuid4().hex[:8]}"
+        atomic_write(file, f"{here}\n")
+        study.set_user_attr(BEGUN_IN, here)
+        return here, here
 
-    begun_in = storage.exclusive(of_study)
+    of_study, of_folder = storage.exclusive(origins)
     # The ID is what counts: machines may see the folder by other paths, or under the same path another folder.
-    is_here = begun_in == file.read_text().partition("\n")[2].strip()
-    return begun_in.rpartition(" ")[0], is_here
+    return of_study.rpartition(" ")[0], of_study == of_folder
 
 
 def _check_elsewhere(settings: StudySettings, begun_in: str, *, is_population: bool, is_command: bool) -> None:
     """Refuse a folder without the checkpoints that a population copies; for other studies, print what it means."""
-    where = f"study.folder is {settings.folder!r}, but the study {settings.name} was begun in {begun_in}"
+    where = (
+        f"study.folder is {settings.folder!r}, but the study {settings.name} was begun in {begun_in}, and its "
+        "files are not here"
+    )
     if is_population:
-        raise StudyError(f"{where}: its members copy checkpoints there, so type the command there, or set study.folder")
+        raise StudyError(f"{where}: its members copy checkpoints of others, so type the command there")
     if is_command:
-        print_sentence(printable(f"note: {where}: trials that were interrupted there begin anew here"))
+        print_sentence(printable(f"note: {where}: trials that were interrupted in the other folder begin anew"))
 
 
 def _tracked_run(

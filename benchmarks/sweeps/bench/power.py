@@ -48,11 +48,15 @@ def needed_seeds(power: pd.DataFrame) -> dict[float, int | None]:
 def residuals_of(surrogate: Surrogate) -> dict[str, FloatArray]:
     """Return the test residuals of the trainings of good configurations, and of the best, as logarithms.
 
-    Nobody compares bad ones, and the noise between seeds depends on the configuration.
+    Nobody compares bad ones, and the noise between seeds depends on the configuration. Whether a configuration counts
+    for a training is decided without that training: otherwise, configurations with a bad seed would be left out.
     """
-    means = surrogate.means[:, -1]
-    groups = {
-        f"configurations with at most {GOOD:.0f} times the steps of the best": means <= means.min() + np.log(GOOD),
-        f"the best {BEST:.0%} of the configurations": means <= np.quantile(means, BEST),
+    means, config_of, residuals = surrogate.means[:, -1], surrogate.config_of, surrogate.residuals[:, -1]
+    n_seeds = np.bincount(config_of)[config_of]
+    # The residuals are differences from the mean, scaled by the root of n / (n - 1).
+    of_others = means[config_of] - residuals / np.sqrt(n_seeds * (n_seeds - 1))
+    ends = {
+        f"configurations with at most {GOOD:.0f} times the steps of the best": means.min() + np.log(GOOD),
+        f"the best {BEST:.0%} of the configurations": np.quantile(means, BEST),
     }
-    return {name: surrogate.residuals[of_group[surrogate.config_of], -1] for name, of_group in groups.items()}
+    return {name: residuals[of_others <= end] for name, end in ends.items()}

@@ -53,8 +53,14 @@ Ends = Callable[[FloatArray, FloatArray, Counts], Mask]
 
 
 def fixed(n_seeds: int) -> SeedRule:
-    """Return the rule that gives the same number of seeds to all."""
-    return partial(_raced, rounds=[n_seeds], drop=lambda _, is_in: is_in)
+    """Return the rule that gives the same number of seeds to all, and chooses the best mean."""
+
+    def choose(scores: FloatArray) -> Chosen:
+        n_choices, n_configs, _ = scores.shape
+        means = scores[..., :n_seeds].mean(axis=-1)
+        return Chosen(means.argmax(axis=1), np.full(n_choices, n_seeds * n_configs))
+
+    return choose
 
 
 def t_race(min_seeds: int, max_seeds: int, level: float) -> SeedRule:

@@ -26,7 +26,8 @@ def test_trials_of_different_code_are_noted(tmp_path, codes, counts):
         trial.set_user_attr(LEASE, {"worker": "w"} | ({CODE: code} if code else {}))
         study.tell(trial, 1.0)
     study.ask().set_user_attr(LEASE, {CODE: "c9 zz"})
-    noted = f"its trials ran different versions of armscan's code ({counts}), so their values may not compare"
+    versions = f"different versions of armscan's code (commit, checksum: trials; {counts})"
+    noted = f"its trials had {versions}; their values may differ"
     assert notes_on(study) == ([noted] if counts else [])
     assert code_notes(study, "the trainings") == ([noted.replace("its trials", "the trainings")] if counts else [])
 

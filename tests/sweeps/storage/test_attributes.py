@@ -29,10 +29,10 @@ from tests.support.refusals import assert_refused
 from tests.sweeps.study.test_study import settings
 
 OF_TRIAL = [*TrialAttributes.model_fields]
-OF_LEASE = ["worker", "host", "pid", "started", "directory", "boot", "pid_namespace", "beat", "seed", "return"]
+OF_LEASE = ["worker", "host", "pid", "started", "directory", "boot", "pid_namespace", "code", "beat", "seed", "return"]
 # Attributes of a study in which some of the odd values are harmless.
 HARMLESS_OF_STUDY = {
-    *(names.STUDY_RUN, names.NOTE_SUM, names.BEGUN_WITH),
+    *(names.STUDY_RUN, names.NOTE_SUM, names.BEGUN_WITH, names.BEGUN_IN),
     *(names.EARLIER_CONFIGS, names.TERMINATED, names.RESET_FAILURES, names.STOP),
 }
 ODD = [None, True, -1, 1.5, 10**400, "x", "\0", "\x1b[31m", [], ["x"], {}, {"a": 1}, {"a": None}, {"0": {"a": {}}}]
@@ -72,7 +72,7 @@ def work_with(study, folder):
 
 def test_every_attribute_is_checked():
     ours = {value for name, value in vars(names).items() if name.isupper() and isinstance(value, str)}
-    assert {*OF_TRIAL, *StudyAttributes.model_fields} == ours - {names.EPISODES, names.SUBJECTS}
+    assert {*OF_TRIAL, *StudyAttributes.model_fields} == ours - {names.EPISODES, names.SUBJECTS, names.CODE}
     assert set(StudyAttributes.model_fields) == {names.SPACE, names.FIXED, names.OBJECTIVES, *HARMLESS_OF_STUDY}
 
 
