@@ -24,7 +24,7 @@ import multiprocessing
 import statistics
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from itertools import cycle, islice
 from pathlib import Path
 
@@ -34,7 +34,7 @@ from tianshou.data import Batch
 from armscan.agents.image_replay import replay_for
 from armscan.agents.replay import Replay
 from armscan.envs import EnvFactory, SliceChannelsObservation
-from armscan.volumes import read_dataset
+from armscan.volumes import LabelVolume
 from benchmarks.arguments import given_volumes
 from benchmarks.tables import print_head, print_row
 
@@ -45,11 +45,11 @@ RULES = {"projection": "zy", "rotation_bounds_deg": (90.0, 45.0), "stack": 4, "m
 NEAR_SHORT, NEAR_LONG = (0.5, (0.0, 0.05), {}), (1.0, (0.15, 0.3), {"success_threshold": 1e-3})
 
 
-def played(folder: str | Path, near: tuple, seed: int) -> list[dict]:
+def played(volumes: Mapping[str, LabelVolume], near: tuple, seed: int) -> list[dict]:
     """Return the transitions of one environment."""
     share, distances, rules = near
     env_factory = EnvFactory(observation=SliceChannelsObservation(shape=(84, 84)), **RULES | rules)
-    env, rng = env_factory.make_env(read_dataset(folder)), np.random.default_rng(seed)
+    env, rng = env_factory.make_env(volumes), np.random.default_rng(seed)
     obs, _ = env.reset(seed=seed)
     transitions = []
     for _ in range(N_PLAYED // N_ENVS):
@@ -64,9 +64,9 @@ def played(folder: str | Path, near: tuple, seed: int) -> list[dict]:
     return transitions
 
 
-def batches(folder: str | Path, near: tuple) -> list[Batch]:
+def batches(volumes: Mapping[str, LabelVolume], near: tuple) -> list[Batch]:
     """Return the transitions of all environments, a batch for each step."""
-    return [Batch(list(step)) for step in zip(*(played(folder, near, i) for i in range(N_ENVS)), strict=True)]
+    return [Batch(list(step)) for step in zip(*(played(volumes, near, i) for i in range(N_ENVS)), strict=True)]
 
 
 def resident_bytes() -> int:
@@ -121,11 +121,11 @@ def compared(image: Replay, plain: Replay, same: bool) -> tuple[float, float, fl
     return tuple(statistics.median(column) for column in zip(*rounds, strict=True))
 
 
-def measure(folder: str | Path, name: str, near: tuple) -> None:
+def measure(volumes: Mapping[str, LabelVolume], name: str, near: tuple) -> None:
     """Print the table of one kind of episode."""
-    steps = batches(folder, near)
+    steps = batches(volumes, near)
     n_ended = sum(int((step.terminated | step.truncated).sum()) for step in steps)
-    space = EnvFactory(observation=SliceChannelsObservation(shape=(84, 84)), **RULES).make_env(read_dataset(folder))
+    space = EnvFactory(observation=SliceChannelsObservation(shape=(84, 84)), **RULES).make_env(volumes)
     plain = Replay(N_PLAIN, N_ENVS)
     image = replay_for(space.observation_space, N_TRANSITIONS, N_ENVS)
     # Compiles: that memory is not the buffer's.
