@@ -65,6 +65,20 @@ def page_of(answer, folder):
     return (folder / "reports" / "a" / "report.html").read_text()
 
 
+def test_report_notes_different_versions_of_the_code(answer, tmp_path):
+    storage = searched(tmp_path, ["mean_steps"])
+    study = optuna.load_study(study_name="a", storage=storage.optuna)
+    for version in ("c1 aa", "c2 bb"):
+        trial = study.ask()
+        trial.suggest_float("agent.lr", 0.0, 1.0)
+        trial.set_user_attr("lease", {"code": version})
+        study.tell(trial, 0.5)
+    assert (
+        "its trials had different versions of armscan&#x27;s code (commit, checksum: trials; c1 aa: 1, c2 bb: 1)"
+        in (page_of(answer, tmp_path))
+    )
+
+
 def test_report_is_one_page_with_every_number_beside_it(answer, tmp_path):
     judge(searched(tmp_path, ["mean_steps"]), tmp_path)
     assert answer("--study=a") == (0, "look at   reports/a/report.html\n", "")

@@ -16,6 +16,7 @@ from armscan.sweeps.scheduling.claim import PendingWrites, PlannedTrial, TrialOu
 from armscan.sweeps.scheduling.state import BEAT_S, StudyState, retried_by, seconds_of
 from armscan.sweeps.storage.attribute_names import (
     ATTEMPT,
+    CODE,
     EARLIER_SPANS,
     FAILURE,
     FINAL_SEED,
@@ -29,6 +30,7 @@ from armscan.sweeps.storage.attribute_names import (
 from armscan.sweeps.storage.reports import reports_of, store_report
 from armscan.sweeps.workers import heartbeat as lease_module
 from armscan.sweeps.workers.heartbeat import Heartbeat, LivenessCheck
+from armscan.tracking import code_version
 from armscan.utils.processes import ProcessInfo, process_start
 from tests.support.waiting import wait_until
 from tests.sweeps.conftest import fail
@@ -484,3 +486,8 @@ def test_failure_that_another_worker_told_is_not_told_again(make_scheduler):
     scheduler.reclaim(lambda _: True)
     scheduler.claim({"worker": "a"}, outcome)
     assert not outcome.is_told
+
+
+def test_claimed_trial_names_the_version_of_the_code_that_runs_it(make_scheduler):
+    heartbeat = Heartbeat(make_scheduler(), "a", should_leave=lambda: False, leave=lambda: None, on_death=pytest.fail)
+    assert heartbeat.claim().user_attrs[LEASE][CODE] == code_version()
