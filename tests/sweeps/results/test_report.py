@@ -73,10 +73,8 @@ def test_report_notes_different_versions_of_the_code(answer, tmp_path):
         trial.suggest_float("agent.lr", 0.0, 1.0)
         trial.set_user_attr("lease", {"code": version})
         study.tell(trial, 0.5)
-    assert (
-        "its trials had different versions of armscan&#x27;s code (commit, checksum: trials; c1 aa: 1, c2 bb: 1)"
-        in (page_of(answer, tmp_path))
-    )
+    noted = "its trials had different versions of armscan&#x27;s code (commit, checksum: trials; c1 aa: 1, c2 bb: 1)"
+    assert noted in page_of(answer, tmp_path)
 
 
 def test_report_is_one_page_with_every_number_beside_it(answer, tmp_path):
