@@ -12,8 +12,8 @@ import statistics
 
 import torch
 
+from benchmarks.arguments import count, parser_of
 from benchmarks.repository import REPOSITORY
-from benchmarks.speed.checkouts import comparing_parser_of
 from benchmarks.speed.training import SHORT, run
 from benchmarks.tables import print_head, print_row
 
@@ -36,7 +36,8 @@ QUICK = ["training.solved=null", "training.validation_episodes=16", "evaluation.
 
 def main() -> None:
     """Print the table."""
-    parser = comparing_parser_of(__doc__, n_rounds=3)
+    parser = parser_of(__doc__)
+    parser.add_argument("--rounds", type=count, default=3, metavar="N", help="rounds of all cases (default: 3)")
     parser.add_argument("cases", nargs="*", metavar="CASE", help="beginning of a name (default: all)")
     given = parser.parse_args()
     cases = [case for case in CASES if not given.cases or case.startswith(tuple(given.cases))]

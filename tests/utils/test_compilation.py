@@ -11,6 +11,7 @@ from filelock import FileLock, Timeout
 from numba.core.caching import IndexDataCacheFile
 
 from armscan.utils.compilation import LOCK_FILE, PACKAGE, _DeferredSignals, cached_njit
+from armscan.utils.processes import interruptions
 
 CALLER = """
 from armscan.utils.compilation import cached_njit
@@ -90,20 +91,23 @@ def test_the_cache_of_a_compiled_function_is_written_by_one_process_at_a_time(mo
     assert len(saved) == 1
 
 
-def test_interrupt_during_compilation_is_handled_at_its_end_and_a_second_one_at_once():
+@pytest.mark.parametrize("number", interruptions())
+def test_interrupt_during_compilation_is_handled_at_its_end_and_a_second_one_at_once(number):
+    earlier = signal.signal(number, signal.default_int_handler)
     deferred = _DeferredSignals()
-    before = signal.getsignal(signal.SIGINT)
+    before = signal.getsignal(number)
     for n_signals in (1, 2):
         deferred.on_start(None)
         # A function that it calls.
         deferred.on_start(None)
-        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(number)
         if n_signals == 2:
             with pytest.raises(KeyboardInterrupt):
-                signal.raise_signal(signal.SIGINT)
+                signal.raise_signal(number)
         deferred.on_end(None)
         with pytest.raises(KeyboardInterrupt):
             deferred.on_end(None)
-        assert signal.getsignal(signal.SIGINT) is before
+        assert signal.getsignal(number) is before
     deferred.on_start(None)
     deferred.on_end(None)
+    signal.signal(number, earlier)
