@@ -393,7 +393,8 @@ def test_interrupted_run_is_closed_as_killed(tmp_path, multirun, ending):
     os.killpg(process.pid, ending)
     assert process.wait(HANG_S) == 130
     output = (tmp_path / "printed").read_text()
-    assert output.rstrip().endswith("interrupted")
+    # Joblib's own process, which a closed terminal ends, may print after it.
+    assert "interrupted" in output.splitlines()
     # If the signal interrupts compiled code, its library may still print where it was; no job has failed.
     assert "failed" not in output
     tracked = runs_in(tmp_path)[1]
