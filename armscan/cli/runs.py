@@ -195,7 +195,7 @@ def sync(folder: Path, tracking: str | None, trust: bool) -> int:
     """
     from armscan.tracking import open_existing_store
     from armscan.tracking import sync as upload_left
-    from armscan.tracking.pending import pending_runs
+    from armscan.tracking.pending_runs import pending_runs
     from armscan.tracking.store import absolute
 
     own = {absolute(default_tracking()["uri"]), *(each.uri for each in pending_runs().values())}

@@ -14,7 +14,7 @@ from armscan.config.trust import TRUST, check_stored_overrides
 from armscan.errors import InvalidValueError, ResumeError, UntrustedError
 from armscan.experiment.resume import check_unfinished, enter_working_folder, resume_run, tag_of
 from armscan.tracking import check_run_id, find_run, open_existing_store
-from armscan.tracking.pending import PendingRun
+from armscan.tracking.pending_runs import PendingRun
 from armscan.tracking.tags import GRID_TAG, WORKING_FOLDER_TAG
 from armscan.utils.files import SQLITE_PREFIX, sqlite_file
 

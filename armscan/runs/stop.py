@@ -12,7 +12,7 @@ from pathlib import Path
 from mlflow.entities import Run
 
 from armscan.errors import TrackingError
-from armscan.tracking.pending import PendingRun
+from armscan.tracking.pending_runs import PendingRun
 from armscan.tracking.tags import PARENT_TAG, STORAGE_TAG, STUDY_TAG, TRIAL_TAG
 
 

@@ -22,7 +22,7 @@ from typing import Any, Literal, Self
 from filelock import FileLock, Timeout
 
 from armscan.errors import FolderInUseError, TrackingError
-from armscan.tracking.pending import PENDING_FOLDER, PendingRun, forget
+from armscan.tracking.pending_runs import PENDING_FOLDER, PendingRun, forget
 from armscan.utils.files import atomic_write, cache_folder, named_if_full, truncate_torn_line
 from armscan.utils.processes import ProcessInfo
 from armscan.utils.run_files import OUTBOX_FOLDER, OUTBOX_SUFFIXES

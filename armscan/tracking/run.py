@@ -14,7 +14,7 @@ from armscan.errors import TrackingError, is_interruption
 from armscan.tracking.environment import environment_tags
 from armscan.tracking.git import DIFF_SUM, code_state
 from armscan.tracking.outbox import Address, Outbox, file_of, now_ms
-from armscan.tracking.pending import forget
+from armscan.tracking.pending_runs import forget
 from armscan.tracking.sanitize import params_of, tags_of
 from armscan.tracking.system_metrics import PREFIX, SystemMetrics
 from armscan.tracking.tags import FAILURE_TAG, PARENT_TAG, PRUNED_TAG, RESUMED_TAG

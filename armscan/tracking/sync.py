@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from armscan.config.trust import TRUST
 from armscan.errors import FolderInUseError, TrackingError, UntrustedError
 from armscan.tracking.outbox import CHANNELS, Address, Outbox, now_ms, outbox_files
-from armscan.tracking.pending import PendingRun, forget, pending_runs
+from armscan.tracking.pending_runs import PendingRun, forget, pending_runs
 from armscan.tracking.run import SHORT_WAIT_S, TrackedRun
 from armscan.tracking.sanitize import tags_of
 from armscan.tracking.store import absolute

@@ -186,7 +186,7 @@ def _fields(path: Path, header: bytes, separator: str) -> dict[str, str]:
 
 
 def _check_n_numbers(path: Path, fields: Mapping[str, str]) -> None:
-    """Raise `VolumeError` if a field of a MetaImage has another number of numbers: SimpleITK would read on."""
+    """Raise `VolumeError` if a MetaImage field lacks numbers, which SimpleITK takes from the next line, or has more."""
     n_dimensions = _whole(path, "NDims", fields["NDims"])
     counts = dict.fromkeys((*SPACINGS, *POSITIONS, "CenterOfRotation"), n_dimensions)
     counts |= dict.fromkeys(DIRECTIONS, n_dimensions**2) | {"Color": 4}

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from armscan.tracking.outbox import file_of
-from armscan.tracking.pending import PENDING_FOLDER
+from armscan.tracking.pending_runs import PENDING_FOLDER
 from armscan.utils.run_files import LOCK_FILE
 
 

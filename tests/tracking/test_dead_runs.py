@@ -13,7 +13,7 @@ from mlflow import MlflowClient
 
 from armscan.tracking import TrackedRun, open_existing_store, open_store, sync
 from armscan.tracking.outbox import Outbox, file_of, now_ms
-from armscan.tracking.pending import PENDING_FOLDER, pending_runs
+from armscan.tracking.pending_runs import PENDING_FOLDER, pending_runs
 from armscan.tracking.sync import FOLDER_REMOVED, PROCESS_DIED, _upload_pending
 from armscan.utils.processes import ProcessInfo
 from tests.support.waiting import HANG_S

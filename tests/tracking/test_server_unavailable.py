@@ -16,7 +16,7 @@ from armscan.cli.main import main
 from armscan.errors import TrackingError, TrackingUnavailableError
 from armscan.tracking import TrackedRun, fail_dead_runs, open_store, record_end, sync, upload_pending, uploader
 from armscan.tracking.outbox import file_of
-from armscan.tracking.pending import pending_runs
+from armscan.tracking.pending_runs import pending_runs
 from armscan.tracking.tracking_store import reason_in, unavailable_reason
 from armscan.utils.files import cache_folder
 from tests.support.disks import small_disk

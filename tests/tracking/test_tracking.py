@@ -31,7 +31,7 @@ from armscan.tracking import (
     uploader,
 )
 from armscan.tracking.outbox import Address, Outbox, file_of
-from armscan.tracking.pending import PENDING_FOLDER, PendingRun, pending_runs
+from armscan.tracking.pending_runs import PENDING_FOLDER, PendingRun, pending_runs
 from armscan.tracking.sanitize import flatten
 from armscan.tracking.sync import _upload_pending, sync
 from armscan.tracking.tags import DESCRIPTION_TAG, VERSION_TAG
