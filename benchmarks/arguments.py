@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import inspect
+import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +14,19 @@ from benchmarks.repository import VOLUMES
 
 if TYPE_CHECKING:
     from armscan.volumes import LabelVolume
+
+
+def run_script(main: Callable[[], None]) -> None:
+    """Run a script; a mistake of the user ends it in one line, as in armscan's commands."""
+    try:
+        main()
+    except Exception as error:
+        # Scripts set the number of threads before they import anything that starts them.
+        from armscan.config.error_messages import print_mistake
+
+        if not print_mistake(error):
+            raise
+        sys.exit(2)
 
 
 def parser_of(description: str | None) -> argparse.ArgumentParser:
@@ -27,9 +41,15 @@ def count(text: str) -> int:
     return int(text)
 
 
+def new_file(text: str) -> Path:
+    """Return a file to be written, whose folder exists."""
+    if not (file := Path(text)).parent.is_dir():
+        raise argparse.ArgumentTypeError(f"{text} cannot be written: there is no folder {file.parent}")
+    return file
+
+
 def labelmaps(text: str) -> dict[str, LabelVolume]:
     """Return the volumes of a folder by name."""
-    # Other scripts set the number of threads before they import anything that starts them.
     from armscan.errors import InvalidValueError
     from armscan.volumes import read_dataset
 
@@ -66,4 +86,5 @@ def call(function: Callable[..., None], given: argparse.Namespace) -> None:
     options: dict[str, Any] = vars(given)
     folder = (options.pop("folder") or Path(tempfile.mkdtemp())).absolute()
     folder.mkdir(parents=True, exist_ok=True)
+    print(f"folder: {folder}", file=sys.stderr)
     function(folder, **options)

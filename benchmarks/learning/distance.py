@@ -19,7 +19,7 @@ from armscan.anatomy import AgreementReward, LandmarkReward, Reward, TissueClust
 from armscan.training.splits import mixed_data
 from armscan.volumes import LabelVolume, ManipulatorAction
 from armscan.volumes.plane import plane_distance
-from benchmarks.arguments import parser_of
+from benchmarks.arguments import parser_of, run_script
 from benchmarks.tables import print_head, print_row
 
 N_PLANES, OFFSET_MM, ANGLE_DEG = 1000, 10.0, 20.0
@@ -82,4 +82,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -27,7 +27,7 @@ from armscan.tracking.tags import AGENT_TAG
 from armscan.training import TEST, evaluate
 from armscan.training.episode_results import EpisodeResult
 from armscan.training.episode_seeds import EVALUATION_SEED
-from benchmarks.arguments import count, parser_of
+from benchmarks.arguments import count, parser_of, run_script
 from benchmarks.tables import print_head, print_row
 
 N_PHANTOMS, N_GROUPS = 12, 10
@@ -102,4 +102,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -20,7 +20,7 @@ from armscan.anatomy import TissueClusters
 from armscan.training.splits import TEST_FIRST_SEED
 from armscan.volumes import LabelVolume, make_phantom, read_dataset
 from armscan.volumes.phantom import VERSIONS
-from benchmarks.arguments import count, parser_of
+from benchmarks.arguments import count, parser_of, run_script
 from benchmarks.tables import print_head, print_row
 
 PLACES_MM = np.arange(-40, 46)
@@ -133,4 +133,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -24,7 +24,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from benchmarks.arguments import parser_of
+from benchmarks.arguments import parser_of, run_script
 from benchmarks.learning.runs import MIXED, add_folder, finished_run
 from benchmarks.repository import PICTURES
 from benchmarks.tables import print_head, print_row
@@ -215,4 +215,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

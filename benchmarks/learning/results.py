@@ -5,8 +5,8 @@
 A row is a preset (`conf/experiment`) or a baseline. Its training volumes are phantoms and all volumes of the folder; it
 is run once for each seed, and judged in 300 episodes on 12 phantoms that it was not trained on, which are moved at each
 reset, with 50 steps at most. The named rows (default: all) are run, `--workers` at a time, unless they have finished in
-the folder of runs. Their figures are kept in `results.json` beside this script, and their table is printed. Without
-`--data`, it is only printed.
+the folder of runs. Their figures are kept in `results.json` in that folder, and their table is printed. Without
+`--data`, the table of the `results.json` beside this script is printed.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from pathlib import Path
 
 from filelock import FileLock
 
-from benchmarks.arguments import count, parser_of
+from benchmarks.arguments import count, parser_of, run_script
 from benchmarks.learning.runs import MIXED, Run, add_folder, finished_run
 from benchmarks.tables import print_head, print_row
 
-FIGURES = Path(__file__).with_name("results.json")
+FIGURES = "results.json"
 TEST = "test volumes"
 JUDGED = ["data.n_test=12", "evaluation.episodes=300"]
 # Figure, digits and factor of each column.
@@ -123,16 +123,17 @@ def measure(name: str, seed: int, data: str, folder: Path) -> None:
     if not ROWS[name].overrides[0].startswith("experiment="):
         overrides.append("data.n_training=64")
     run = finished_run(f"{name}-seed{seed}", [*MIXED, f"data.path={data}", *overrides], folder)
+    file = folder / FIGURES
     # Several processes may each measure some rows.
-    with FileLock(f"{FIGURES}.lock"):
-        kept = json.loads(FIGURES.read_text()) if FIGURES.exists() else {}
+    with FileLock(f"{file}.lock"):
+        kept = json.loads(file.read_text()) if file.exists() else {}
         kept.setdefault(name, {})[str(seed)] = figures_of(run)
-        FIGURES.write_text(json.dumps(kept, indent=1, sort_keys=True) + "\n")
+        file.write_text(json.dumps(kept, indent=1, sort_keys=True) + "\n")
 
 
-def print_tables(rows: Collection[str] = tuple(ROWS)) -> None:
-    """Print two tables of the kept figures of these rows: the figures of each seed, and the goals."""
-    kept = json.loads(FIGURES.read_text())
+def print_tables(file: Path, rows: Collection[str]) -> None:
+    """Print two tables of the figures in a file, for these rows: the figures of each seed, and the goals."""
+    kept = json.loads(file.read_text())
     found = {name: [kept[name][seed] for seed in sorted(kept[name])] for name in ROWS if name in kept and name in rows}
     print_head("", *COLUMNS)
     for name, of_seeds in found.items():
@@ -179,8 +180,8 @@ def main() -> None:
             ]
             for each in waiting:
                 each.result()
-    print_tables(rows)
+    print_tables(given.folder / FIGURES if given.data else Path(__file__).with_name(FIGURES), rows)
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from mlflow import MlflowClient
 
+from armscan.errors import InvalidValueError
 from armscan.tracking import open_store
 
 # Trains on a folder and on phantoms; validates and tests on phantoms alone.
@@ -68,11 +69,19 @@ def add_folder(parser: argparse.ArgumentParser) -> None:
 
 
 def finished_run(name: str, overrides: Sequence[str], folder: Path) -> Run:
-    """Run `armscan.run` with the overrides, unless a run of that name has finished in the folder already."""
+    """Run `armscan.run` with the overrides, unless a run of that name has finished in the folder already.
+
+    Raises:
+        InvalidValueError: That run had other overrides, such as other volumes.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    run_folder = folder / name
+    run_folder, command_file = folder / name, folder / f"{name}.overrides"
     store = f"sqlite:///{folder.absolute()}/mlruns.db"
-    if not (run_folder / "run_id").exists():
+    if (run_folder / "run_id").exists():
+        if (before := command_file.read_text().split("\n")) != [*overrides]:
+            raise InvalidValueError(f"{run_folder} is a run with {before}, not with {[*overrides]}: delete it first")
+    else:
+        command_file.write_text("\n".join(overrides))
         command = [
             *(sys.executable, "-m", "armscan.run", *overrides),
             *(f"hydra.run.dir={run_folder.absolute()}", f"tracking.uri={store}", f"tracking.experiment={name}"),

@@ -4,7 +4,8 @@
 
 Both learn from the same random steps on phantoms, batches of 256, each in a process of its own, on one thread.
 Tianshou's step runs the code of CHECKOUT (default: this one). The figures to quote are the ratios, medians over the
-rounds. A call takes as many compiled steps as `agent=sac` takes after a collection.
+rounds. A call takes as many compiled steps as `agent=sac` takes after a collection. They depend on the kernels that
+OpenBLAS chooses for the processor: the script prints which, and a set `OPENBLAS_CORETYPE` overrides the choice.
 """
 
 from __future__ import annotations
@@ -14,6 +15,9 @@ import sys
 import time
 from collections.abc import Callable
 from functools import cache
+from importlib import import_module
+
+from threadpoolctl import threadpool_info
 
 from benchmarks.repository import REPOSITORY
 from benchmarks.speed.checkouts import ask, comparing_parser_of, serve, start
@@ -35,6 +39,7 @@ def main() -> None:
         serve(step_ms)
         return
     given = comparing_parser_of(__doc__, n_rounds=15).parse_args()
+    print(f"OpenBLAS kernels: {kernels()}\n")
     print_head("projection, network", "Tianshou, ms", "compiled, ms", "ratio, median", "least", "most")
     with start(__file__, given.before or REPOSITORY) as theirs, start(__file__, REPOSITORY) as ours:
         for case in CASES:
@@ -46,6 +51,12 @@ def main() -> None:
             tianshou, compiled = (statistics.median(each) for each in zip(*rounds, strict=True))
             figures = (f"{each:.1f}" for each in (statistics.median(ratios), min(ratios), max(ratios)))
             print_row(case, f"{tianshou:.2f}", f"{compiled:.3f}", *figures)
+
+
+def kernels() -> str:
+    """Return the processor that OpenBLAS has chosen its kernels for."""
+    import_module("scipy.linalg")
+    return ", ".join(sorted({each["architecture"] for each in threadpool_info() if each["internal_api"] == "openblas"}))
 
 
 def step_ms(case: str) -> float:

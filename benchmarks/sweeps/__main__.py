@@ -20,7 +20,7 @@ import os
 # Before the libraries that start threads are imported.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-from benchmarks.arguments import add_options_of, call, parser_of
+from benchmarks.arguments import add_options_of, call, parser_of, run_script
 from benchmarks.sweeps.compare_sweepers import compare
 from benchmarks.sweeps.kill_workers import kill
 from benchmarks.sweeps.occupancy import idle
@@ -41,4 +41,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -24,7 +24,7 @@ from armscan.stats.aggregation import probability_of_improvement
 from armscan.stats.bootstrap import LOWER, N_RESAMPLES, UPPER
 from armscan.stats.paired import crossed_mean
 from armscan.sweeps.scheduling.race import MAX_SEEDS_FACTOR, race
-from benchmarks.arguments import count, parser_of
+from benchmarks.arguments import count, parser_of, run_script
 from benchmarks.tables import print_head, print_row
 
 N_CANDIDATES, N_VALIDATION, MIN_SEEDS, MEAN_SEEDS = 4, 8, 2, 12
@@ -114,4 +114,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -13,9 +13,10 @@ from typing import Self
 
 from optuna.trial import FrozenTrial
 
+from armscan.errors import InvalidValueError
 from armscan.sweeps.scheduling.state import StudyState
 from armscan.sweeps.storage.attribute_names import METRICS
-from benchmarks.sweeps.studies import N_WORKERS, SLEEPING, by_worker, finish
+from benchmarks.sweeps.studies import JOURNAL, N_WORKERS, SLEEPING, by_worker, finish
 from benchmarks.sweeps.wait import Waited
 
 
@@ -77,7 +78,9 @@ def share_in_trials(state: StudyState) -> float:
 
 
 def slept(folder: Path, trials: int, shortest_s: float, longest_s: float) -> StudyState:
-    """Run a study of `benchmarks.sweeps.sleeping` in a folder, and return its state."""
+    """Run a study of `benchmarks.sweeps.sleeping` in a folder that has none, and return its state."""
+    if (folder / JOURNAL).exists():
+        raise InvalidValueError(f"{folder} has a study already, whose trials would count, too: give another --folder")
     lengths = (f"+study.task.shortest_s={shortest_s}", f"+study.task.longest_s={longest_s}")
     return finish(folder, *SLEEPING, *lengths, f"study.n_trials={trials}")
 

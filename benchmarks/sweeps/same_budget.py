@@ -24,7 +24,6 @@ import contextlib
 import functools
 import json
 import shutil
-import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
@@ -34,6 +33,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from armscan.errors import InvalidValueError
 from armscan.stats.paired import paired_difference
 from armscan.utils.arrays import FloatArray
 from armscan.utils.log import silence_libraries
@@ -97,11 +97,13 @@ def same_budget(
         seeds: Number of seeds that judge each configuration. Default: 8.
     """
     if unknown := [name for name in tasks if name not in TASKS]:
-        sys.exit(f"--tasks: {unknown[0]!r} is none of {', '.join(TASKS)}")
+        raise InvalidValueError(f"--tasks: {unknown[0]!r} is none of {', '.join(TASKS)}")
+    if seeds > SEEDS_APART:
+        raise InvalidValueError(f"--seeds is {seeds}, but replicates have {SEEDS_APART} seeds of their own, no more")
     silence_libraries()
     results = Results(folder / "results.jsonl")
     if not replicates and not results.rows:
-        sys.exit(f"{folder} has no results.jsonl: give the folder of a comparison, or --replicates N")
+        raise InvalidValueError(f"{folder} has no results.jsonl: give the folder of a comparison, or --replicates N")
     with contextlib.chdir(folder):
         for replicate in range(first, first + replicates):
             for name in tasks:
@@ -112,7 +114,6 @@ def same_budget(
 
 
 def _replicate(results: Results, name: str, replicate: int, n_seeds: int) -> None:
-    assert n_seeds <= SEEDS_APART, f"seeds is {n_seeds}, but replicates have seeds of their own up to {SEEDS_APART}"
     task, known = TASKS[name], {"task": name, "replicate": replicate}
     # They take turns in searching first.
     for side in (ARMSCAN, HYDRA) if replicate % 2 else (HYDRA, ARMSCAN):

@@ -35,7 +35,7 @@ from armscan.sweeps.workers.heartbeat import Heartbeat
 from armscan.sweeps.workers.worker import Worker
 from armscan.tracking import open_store
 from armscan.utils.retry import RetryPolicy
-from benchmarks.arguments import count, parser_of
+from benchmarks.arguments import count, parser_of, run_script
 from benchmarks.tables import print_head, print_row
 from tests.support.mlflow_server import mlflow_server
 from tests.support.postgres import PostgresServer, postgres_server
@@ -224,4 +224,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

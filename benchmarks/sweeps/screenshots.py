@@ -22,7 +22,7 @@ from armscan.sweeps.storage.storage import existing_storage
 from armscan.tracking.store import open_existing_store
 from armscan.ui.runs_page import runs_page
 from armscan.ui.servers import HOST, mlflow_server, start_dashboard
-from benchmarks.arguments import parser_of
+from benchmarks.arguments import parser_of, run_script
 from benchmarks.repository import PICTURES
 from tests.support.browser import chromium
 
@@ -84,4 +84,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

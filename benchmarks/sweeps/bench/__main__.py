@@ -14,9 +14,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import argparse
 from itertools import product
-from pathlib import Path
 
-from armscan.errors import InvalidValueError
+from benchmarks.arguments import count, new_file, run_script
 from benchmarks.sweeps.bench.collect import collect
 from benchmarks.sweeps.bench.ranking import SAMPLERS
 from benchmarks.sweeps.bench.replay import DEFAULT, silence
@@ -30,15 +29,15 @@ def main() -> None:
     commands = parser.add_subparsers(dest="command", required=True)
     collecting = commands.add_parser("collect", help="train what is missing in a table")
     collecting.add_argument("sweep", help="name of the sweep, such as sac_y")
-    collecting.add_argument("--configs", type=int, default=300, help="configurations (default: 300)")
-    collecting.add_argument("--seeds", type=int, default=8, help="trainings of each (default: 8)")
-    collecting.add_argument("--workers", type=int, default=1, help="processes that train (default: 1)")
+    collecting.add_argument("--configs", type=count, default=300, help="configurations (default: 300)")
+    collecting.add_argument("--seeds", type=count, default=8, help="trainings of each (default: 8)")
+    collecting.add_argument("--workers", type=count, default=1, help="processes that train (default: 1)")
     collecting.add_argument("--allow-changes", action="store_true", help="although settings have changed since")
     replaying = commands.add_parser("report", help="simulate studies, and print their tables")
     replaying.add_argument("sweep", help="name of the sweep, such as sac_y")
-    replaying.add_argument("--studies", type=int, default=200, help="studies of each rule (default: 200)")
-    replaying.add_argument("--trainings", type=int, default=40, help="budget of each search (default: 40)")
-    replaying.add_argument("--resamples", type=int, default=50, help="resamples of importances (default: 50)")
+    replaying.add_argument("--studies", type=count, default=200, help="studies of each rule (default: 200)")
+    replaying.add_argument("--trainings", type=count, default=40, help="budget of each search (default: 40)")
+    replaying.add_argument("--resamples", type=count, default=50, help="resamples of importances (default: 50)")
     replaying.add_argument(
         "--samplers",
         nargs="+",
@@ -46,19 +45,14 @@ def main() -> None:
         default=SAMPLERS,
         help="samplers to compare (default: all but gp, which takes hours)",
     )
-    replaying.add_argument("--workers", type=int, default=1, help="processes that simulate (default: 1)")
-    replaying.add_argument("--picture", type=Path, help="a PNG file that is written")
+    replaying.add_argument("--workers", type=count, default=1, help="processes that simulate (default: 1)")
+    replaying.add_argument("--picture", type=new_file, help="a PNG file that is written")
     starting = commands.add_parser("warm-start", help="simulate studies that begin with known settings")
     starting.add_argument("source", help="name of the sweep that the settings are from, such as sac_y")
     starting.add_argument("target", help="name of the sweep that begins with them, such as sac_zy")
-    starting.add_argument("--studies", type=int, default=20, help="studies (default: 20)")
+    starting.add_argument("--studies", type=count, default=20, help="studies (default: 20)")
     starting.add_argument("--pruner", default=DEFAULT.pruner, help=f"pruner of the target (default: {DEFAULT.pruner})")
-    given = parser.parse_args()
-    try:
-        _run(given)
-    # A table that is not there, or not fit for the command.
-    except InvalidValueError as error:
-        parser.error(str(error))
+    _run(parser.parse_args())
 
 
 def _run(given: argparse.Namespace) -> None:
@@ -88,4 +82,4 @@ def _run(given: argparse.Namespace) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -114,6 +114,7 @@ def _between(low: float, high: float, place: float) -> float:
     return low + (high - low) * place
 
 
-def _sha256(config: Mapping[str, Any]) -> str:
+def _sha256(config: DictConfig) -> str:
+    values: Any = OmegaConf.to_container(config, resolve=True)
     # Where runs are tracked does not change a curve.
-    return config_sha256({key: value for key, value in config.items() if key != "tracking"})[:12]
+    return config_sha256({key: value for key, value in values.items() if key != "tracking"})[:12]

@@ -15,7 +15,7 @@ from armscan.stats.aggregation import band_over_seeds, probability_of_improvemen
 from armscan.utils.arrays import FloatArray
 from benchmarks.sweeps.bench.design import presets_of
 from benchmarks.sweeps.bench.replay import DEFAULT, Rule, choose, scores_of, search, silence
-from benchmarks.sweeps.bench.seed_rules import MAX_SEEDS
+from benchmarks.sweeps.bench.seed_rules import MAX_SEEDS, fixed
 from benchmarks.sweeps.bench.surrogate import SimulatedConfig, Surrogate
 
 SAMPLERS, PRUNERS = ("random", "tpe", "cmaes", "nsga2"), ("none", "median", "halving")
@@ -30,7 +30,7 @@ class Final(NamedTuple):
 
     Args:
         min_seeds: Seeds that each configuration gets first.
-        mean_seeds: Seeds of a configuration on average, at most.
+        mean_seeds: Seeds of a configuration on average, at most. If they are `min_seeds`, the best mean is chosen.
         has_control: Whether the control races, too. Default: True.
         top_k: Number of the best trials that race. Default: 3.
     """
@@ -98,13 +98,16 @@ def studies_of(
         found = search(surrogate, sweep, rule, n_trainings=n_trainings, seed=number, enqueued=enqueued)
         tops = [candidate.config for candidate in found.candidates[: max(final.top_k for final in FINALS.values())]]
         row = {**vars(rule), "study": number, "n_trials": found.n_trials, "search": tops[0].truth - best}
-        scores = scores_of([control, *tops], MAX_SEEDS, np.random.default_rng(number))
+        scores = scores_of([control, *tops], MAX_SEEDS, np.random.default_rng([number, 1]))
         for name, final in FINALS.items():
             # The control is first, so that it wins a tie, as in armscan.
             racing = [control, *tops][not final.has_control : 1 + final.top_k]
             of_racing = scores[not final.has_control : 1 + final.top_k]
-            chosen = choose(of_racing, min_seeds=final.min_seeds, mean_seeds=final.mean_seeds)
-            row |= {name: racing[chosen.place].truth - best, f"{name}_trainings": chosen.n_trainings}
+            if final.mean_seeds == final.min_seeds:
+                (place,), (n_raced,) = fixed(final.min_seeds)(of_racing[np.newaxis])
+            else:
+                place, n_raced = choose(of_racing, min_seeds=final.min_seeds, mean_seeds=final.mean_seeds)
+            row |= {name: racing[place].truth - best, f"{name}_trainings": n_raced}
         return row
 
     studies = itertools.product(compared, range(n_studies))

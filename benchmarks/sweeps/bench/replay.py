@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import optuna
@@ -143,8 +143,7 @@ def _run(trial: Trial, config: SimulatedConfig, n_seeds: int, rng: np.random.Gen
     return float(interquartile_mean(np.array(best))), n_seeds * total
 
 
-@dataclass(frozen=True)
-class Choice:
+class Choice(NamedTuple):
     """Choice of a final evaluation.
 
     Args:
