@@ -127,6 +127,7 @@ def _check_kept(run: FoundRun, folder: Path) -> None:
         raise _not_kept(run)
     try:
         model = Model.load(str(folder))
+        of_run = dict(model.metadata or {}).get("run")
         example: Any = model.load_input_example(str(folder))
         onnx_answers(folder / ONNX_FILE, example)
     # A damaged file may raise anything.
@@ -135,7 +136,7 @@ def _check_kept(run: FoundRun, folder: Path) -> None:
             f"run {run.run_id}: its {POLICY_FOLDER}/ is damaged, it does not answer its own example: {reason_in(error)}"
         ) from error
     # A SHA-256 may have been copied from another run together with its model.
-    if (model.metadata or {}).get("run") != run.run_id:
+    if of_run != run.run_id:
         raise _not_kept(run)
 
 
