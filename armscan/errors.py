@@ -27,7 +27,7 @@ class ArmscanError(Exception):
 
 def print_error(message: str) -> None:
     """Print an error message, wrapped between words on a terminal, and on one line in a file or pipe."""
-    line = f"error: {message}"
+    line = printable(f"error: {message}")
     if sys.stderr.isatty():
         width = shutil.get_terminal_size().columns
         line = textwrap.fill(line, width, break_long_words=False, break_on_hyphens=False)

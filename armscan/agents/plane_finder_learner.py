@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -24,9 +23,8 @@ from armscan.envs.rules import Observed
 from armscan.envs.vector_env import reset_each
 from armscan.errors import InvalidValueError
 from armscan.utils.arrays import FloatArray
+from armscan.volumes.phantom.generate import PHANTOM_NAME
 
-# Names of phantoms; those of files have an extension.
-PHANTOM = re.compile(r"phantom-[\w-]+")
 # Perturbed looks: range of the standard deviations, in mm and degrees, which are drawn log-uniformly.
 PERTURBED_MM, PERTURBED_DEG = (0.5, 6.0), (1.0, 8.0)
 # Factors on the loss thresholds for the first look: two tilts, distance along the normal, position across.
@@ -84,9 +82,8 @@ class PlaneFinderLearner(SupervisedLearner):
     def _volumes(self, rng: np.random.Generator, n_episodes: int) -> dict[str, Any] | None:
         """Draw the volume of each episode by `phantom_share`; None leaves the choice to the environments."""
         phantom_share, names = self._finder.phantom_share, self._labelled_envs.rules.names
-        groups = [
-            [name for name in names if bool(PHANTOM.fullmatch(name)) == of_phantoms] for of_phantoms in (True, False)
-        ]
+        phantoms = [name for name in names if PHANTOM_NAME.fullmatch(name)]
+        groups = phantoms, [name for name in names if name not in phantoms]
         if phantom_share is None or not all(groups):
             return None
         chosen = (rng.random(n_episodes) >= phantom_share).astype(int)

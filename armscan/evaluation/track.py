@@ -96,7 +96,7 @@ def evaluate_and_track(
         sections, described = [], [f"Note: {note}." for note in notes]
         for label, table in report.tables().items():
             of_label = [f"Note: {note}." for note in notes_on(prepared, report, label)]
-            paragraphs = "".join(f"<p>{note}</p>" for note in of_label)
+            paragraphs = "".join(f"<p>{html.escape(note)}</p>" for note in of_label)
             sections.append(f"<h2>{html.escape(label)}</h2>{table.html()}{paragraphs}")
             described += [f"### {label}", table.markdown(), *of_label]
         atomic_write(shown, page(tracked.name, "".join(sections), notes=notes))

@@ -99,22 +99,15 @@ class Job:
         number: Number of the job, from 0.
         overrides: All overrides of the job, as one would type them to run it alone.
         varied: Overrides that differ from those of the other jobs.
-        parent_run_id: MLflow run ID of its parent run.
         folder: Folder of the grid.
-        repeats: MLflow run ID of the grid that is repeated without its finished jobs. Default: None, a new grid.
-        is_trusted: Whether it may build any class; false if its overrides were stored and not trusted. Default: True.
-        launcher: Process of the grid's launcher, with which the job ends. Default: None, it goes on without it, as on a
-            cluster.
+        grid: The grid.
     """
 
     number: int
     overrides: str
     varied: str
-    parent_run_id: str
     folder: Path
-    repeats: str | None = None
-    is_trusted: bool = True
-    launcher: ProcessInfo | None = None
+    grid: Grid
 
     @classmethod
     def current(cls) -> Self | None:
@@ -128,11 +121,8 @@ class Job:
             hydra_config.job.num,
             shlex.join(overrides),
             " ".join(override for override in overrides if override not in grid.shared),
-            grid.run_id,
             folder,
-            grid.repeats,
-            grid.is_trusted,
-            grid.launcher,
+            grid,
         )
 
     @property
@@ -164,14 +154,14 @@ class Invocation:
         overrides: Overrides on the command line.
         command: Command line; for a job, the one that repeats it alone.
         choices: Choice of each configuration group.
-        job: Job of a grid; None for a single run.
+        job: Job of a grid. Default: None, no grid.
     """
 
     folder: Path
     overrides: list[str]
     command: str
     choices: dict[str, str]
-    job: Job | None
+    job: Job | None = None
 
     @classmethod
     def current(cls) -> Self:

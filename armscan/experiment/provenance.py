@@ -64,6 +64,7 @@ def start_tracking(
     invocation: Invocation,
     setup: RunSetup,
     *,
+    parent_id: str | None = None,
     tags: Mapping[str, str] | None = None,
     retry_s: float | None = None,
 ) -> TrackedRun:
@@ -75,6 +76,7 @@ def start_tracking(
         config: Composed configuration.
         invocation: Command line, overrides and folder of the run.
         setup: Objects built from the configuration.
+        parent_id: MLflow run ID of its parent run. Default: None, a run of its own.
         tags: Further tags of the run. Default: none.
         retry_s: Seconds to wait for an unavailable store. Default: None, no waiting.
     """
@@ -109,7 +111,7 @@ def start_tracking(
             **(tags or {}),
         },
         folder=invocation.folder,
-        parent_id=job.parent_run_id if job else None,
+        parent_id=parent_id,
     )
     with ExitStack() as stack:
         tracked = stack.enter_context(started)

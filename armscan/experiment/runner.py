@@ -69,7 +69,7 @@ def run_experiment(config: DictConfig, invocation: Invocation) -> dict[str, dict
             check_episodes(setup)
             if unused := unused_network(config, setup.training_env.observation_space, invocation.overrides):
                 print_sentence(f"note: {unused!r} has no effect: network=auto chooses by the observation")
-            tracked = start_tracking(config, invocation, setup)
+            tracked = start_tracking(config, invocation, setup, parent_id=job.grid.run_id if job else None)
         return run_tracked(setup, tracked, invocation.folder, config.tracking.uri, job_label=job.label if job else None)
 
 
@@ -127,6 +127,9 @@ def run_tracked(
         tell("writing the results, the video of an episode, and the policy")
         record_episode(setup.agent, setup.video_env, folder / VIDEO_FILE, seed=VIDEO_SEED + setup.seed)
         keep_results(tracked, result, reached, folder)
+        if result:
+            draw_learning_curve(result.reports, folder / LEARNING_CURVE_FILE, title=tracked.name)
+        tracked.log_results(folder)
         if isinstance(setup.agent, Learner):
             with no_garbage_collection():
                 # Deferred: exporting a policy loads more than training does, and comes last.
@@ -205,26 +208,23 @@ def train_agent(
 
 
 def keep_results(tracked: TrackedRun, result: TrainingResult | None, reached: RunResult, folder: Path) -> None:
-    """Log the final figures, and store the run's files in its folder.
+    """Log the final figures, write the results into the run's folder, and tag the run with their checksums.
 
     Args:
         tracked: Run to log to.
         result: Result of the training. Figures are logged at its best epoch, whose weights they evaluate. None if there
             was nothing to learn.
         reached: Final evaluations, and the baselines.
-        folder: Folder of the run; takes the picture of the learning curve, the episodes and the table.
+        folder: Folder of the run.
     """
-    log_result(tracked, result, reached)
-    if result:
-        draw_learning_curve(result.reports, folder / LEARNING_CURVE_FILE, title=tracked.name)
+    _log_result(tracked, result, reached)
     reached.write(folder, title=tracked.name)
     files = {tag: folder / name for name, tag in RESULT_SHA256_TAGS.items()}
     tracked.set_tags({tag: sha256(file.read_bytes()) for tag, file in files.items() if file.exists()})
-    tracked.log_results(folder)
 
 
-def log_result(tracked: TrackedRun, result: TrainingResult | None, reached: RunResult) -> None:
-    """Log the final figures, the best checkpoint as a model, and the table as description; see `keep_results`."""
+def _log_result(tracked: TrackedRun, result: TrainingResult | None, reached: RunResult) -> None:
+    """Log the final figures, the best checkpoint as a model, and the table as description."""
     for name, metrics in reached.metrics().items():
         figures = {f"{name.replace(' ', '_')}/{figure}": value for figure, value in metrics.items()}
         # Training has already logged the validations.

@@ -23,8 +23,8 @@ def start_job(config: DictConfig, invocation: Invocation, job: Job) -> None:
 
     If it is killed, for example out of memory, the launcher and the other jobs continue.
     """
-    if job.launcher is not None and not job.launcher.is_current:
-        _end_with(job.launcher)
+    if job.grid.launcher is not None and not job.grid.launcher.is_current:
+        _end_with(job.grid.launcher)
     if not job.claims(invocation.folder):
         failure = f"its folder, {invocation.folder}, is another job's: hydra.sweep.subdir must differ between jobs"
         job.write_outcome(failure=failure)
@@ -70,7 +70,7 @@ def run_job(launcher_pid: int) -> None:
     for each in endings:
         signal.signal(each, leave)
     try:
-        if job.repeats is not None:
+        if job.grid.repeats is not None:
             from armscan.launch.resume_grid import run_again
 
             metrics = run_again(config, invocation, job)

@@ -21,7 +21,7 @@ from armscan.config.defaults import TRACKING_URI, to_plain
 from armscan.config.error_messages import one_line_message
 from armscan.config.task import have_same_task
 from armscan.config.trust import needs_trust, untrusted_override
-from armscan.errors import InvalidValueError, TrackingError
+from armscan.errors import InvalidValueError, TrackingError, print_error
 from armscan.experiment.job import (
     INTERRUPTED,
     NO_OUTCOME,
@@ -139,7 +139,7 @@ def _exit_on_error() -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        print(f"error: {one_line_message(error) or repr(error)}", file=sys.stderr)
+        print_error(one_line_message(error) or repr(error))
         raise SystemExit(2) from error
 
 

@@ -6,7 +6,6 @@ A job's earlier run is found by the checksums of its configuration and its volum
 from __future__ import annotations
 
 import contextlib
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,16 +17,17 @@ from armscan.config.defaults import FOLD, to_plain
 from armscan.config.own_code import changed_modules
 from armscan.config.task import is_under
 from armscan.config.trust import check_composed
-from armscan.errors import TrackingError
+from armscan.errors import ArmscanError, TrackingError
 from armscan.experiment.build import check_keys, set_up
 from armscan.experiment.job import Invocation, Job
 from armscan.experiment.provenance import provenance_files, sha256_tags
 from armscan.experiment.results import LAST_VALIDATION, figures_of
 from armscan.experiment.resume import check_own_code, resume_run
 from armscan.experiment.runner import run_experiment
+from armscan.launch.resume import grid_overrides
 from armscan.tracking import TrackingStore, load_run, open_store, sync
 from armscan.tracking.sanitize import params_of
-from armscan.tracking.tags import FOLDER_TAG, GRID_TAG, JOB_TAG, OWN_CODE_TAG, PARENT_TAG, STUDY_TAG
+from armscan.tracking.tags import FOLDER_TAG, JOB_TAG, OWN_CODE_TAG, PARENT_TAG, STUDY_TAG
 from armscan.training import Fingerprints, check_unchanged
 from armscan.utils.run_files import LAST_CHECKPOINT, folder_lock
 
@@ -41,15 +41,15 @@ def run_again(config: DictConfig, invocation: Invocation, job: Job) -> Metrics:
     """Return the metrics of a job's finished run; resume an interrupted one, or run the job."""
     check_keys(config)
     resolved = to_plain(config)
-    if not job.is_trusted:
+    if not job.grid.is_trusted:
         check_composed(resolved, where=f"job {job.number}")
     setup = set_up(config)
     store, experiment_id = open_store(**resolved["tracking"])
     earlier = earlier_runs(store, experiment_id, sha256_tags(provenance_files(resolved, setup)), job)
-    if not any(run.data.tags.get(PARENT_TAG) == job.repeats for run in earlier):
+    if not any(run.data.tags.get(PARENT_TAG) == job.grid.repeats for run in earlier):
         _check_volumes(store, experiment_id, params_of(resolved), setup.fingerprints, job)
     for run in earlier:
-        if run.data.tags.get(PARENT_TAG) == job.repeats:
+        if run.data.tags.get(PARENT_TAG) == job.grid.repeats:
             check_own_code(run, setup)
     # Of other grids, and single runs.
     earlier = [run for run in earlier if not changed_modules(run.data.tags.get(OWN_CODE_TAG), setup.own_code)]
@@ -60,7 +60,7 @@ def run_again(config: DictConfig, invocation: Invocation, job: Job) -> Metrics:
             return _metrics_of(run)
     for run in earlier:
         folder = run.data.tags.get(FOLDER_TAG)
-        is_of_grid = run.data.tags.get(PARENT_TAG) == job.repeats
+        is_of_grid = run.data.tags.get(PARENT_TAG) == job.grid.repeats
         if is_of_grid and run.info.status == "RUNNING" and folder is not None and Path(folder).is_dir():
             # Raises if the run is in progress, as after its launcher was killed: it would be trained twice.
             with folder_lock(Path(folder)):
@@ -89,12 +89,12 @@ def earlier_runs(store: TrackingStore, experiment_id: str, sums: Mapping[str, st
     wanted = " and ".join(f"tags.`{tag}` = '{value}'" for tag, value in sums.items())
     found = store.search_runs([experiment_id], wanted, order_by=["attributes.start_time DESC"])
     parents = {run.info.run_id: run.data.tags.get(PARENT_TAG) for run in found if STUDY_TAG not in run.data.tags}
-    known = [each for each in {*parents.values(), job.parent_run_id} if each is not None and each.isalnum()]
+    known = [each for each in {*parents.values(), job.grid.run_id} if each is not None and each.isalnum()]
     grids = store.runs([experiment_id], f"attributes.run_id IN ({', '.join(map(repr, known))})")
     overrides = {grid.info.run_id: _overrides_of(grid) for grid in grids}
-    kin = {grid for grid in overrides if overrides[grid] == overrides.get(job.parent_run_id)} | {job.repeats, None}
+    kin = {grid for grid in overrides if overrides[grid] == overrides.get(job.grid.run_id)} | {job.grid.repeats, None}
     own = [run for run in found if run.info.run_id in parents and parents[run.info.run_id] in kin]
-    return sorted(own, key=lambda run: parents[run.info.run_id] != job.repeats)
+    return sorted(own, key=lambda run: parents[run.info.run_id] != job.grid.repeats)
 
 
 def _check_volumes(
@@ -104,8 +104,8 @@ def _check_volumes(
 
     The folds of a cross-validation have the same volumes, in other parts; another subject would be another fold.
     """
-    assert job.repeats is not None
-    for run in store.children(experiment_id, job.repeats):
+    assert job.grid.repeats is not None
+    for run in store.children(experiment_id, job.grid.repeats):
         if _data_in(run.data.params) != _data_in(params):
             continue
         # A run that was killed at its start has no record of its volumes.
@@ -125,14 +125,14 @@ def _joined(prints: Fingerprints) -> dict[str, str]:
 
 def _overrides_of(grid: Run) -> set[str]:
     """Return the overrides that repeat a grid, each once; empty for a run that is not a grid."""
-    with contextlib.suppress(ValueError, TypeError):
-        return set(json.loads(grid.data.tags[GRID_TAG])) if GRID_TAG in grid.data.tags else set()
+    with contextlib.suppress(ArmscanError):
+        return set(grid_overrides(grid))
     return set()
 
 
 def _set_parent(store: TrackingStore, run: Run, job: Job) -> None:
     """Make a run a child of the grid that is repeated."""
-    store.set_tag(run.info.run_id, PARENT_TAG, job.parent_run_id)
+    store.set_tag(run.info.run_id, PARENT_TAG, job.grid.run_id)
     store.set_tag(run.info.run_id, JOB_TAG, str(job.number))
 
 

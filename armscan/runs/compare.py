@@ -48,8 +48,10 @@ class Difference:
 
     @property
     def relative(self) -> float:
-        """Largest difference, as a share of the first run's value at that step; infinite if that is 0 or missing."""
-        return abs(self.largest / self.then) if self.largest is not None and self.then else math.inf
+        """Largest difference, as a share of the first run's value there; infinite if that is 0, NaN or missing."""
+        share = abs(self.largest / self.then) if self.largest is not None and self.then else math.inf
+        # Of two infinite numbers, or of NaN.
+        return math.inf if math.isnan(share) else share
 
     def __str__(self) -> str:
         """Return the difference in one line."""
@@ -58,9 +60,10 @@ class Difference:
         missing = f"; {self.n_missing} points are missing" if self.n_missing else ""
         if self.largest == 0.0:
             return f"{self.metric}: the same{missing}"
+        share = f" ({self.relative:.2%})" if math.isfinite(self.relative) else ""
         return (
-            f"{self.metric}: by {self.largest:.3g} ({self.relative:.2%}) at step {self.at_step}, where {self.then:.6g} "
-            f"became {self.now:.6g}{missing}"
+            f"{self.metric}: by {self.largest:.3g}{share} at step {self.at_step}, where {self.then:.6g} became "
+            f"{self.now:.6g}{missing}"
         )
 
 

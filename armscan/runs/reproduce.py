@@ -117,8 +117,7 @@ def differences(original: Original) -> list[str]:
     changed = {name: f"{name} was {then}, and is {now}" for name, (then, now) in pairs.items() if then != now}
     lines += [line for name, line in changed.items() if name in REPORTED_PACKAGES]
     if others := [name for name in changed if name not in REPORTED_PACKAGES]:
-        shown = ", ".join(others[:N_SHOWN]) + (", ..." if len(others) > N_SHOWN else "")
-        lines.append(f"other packages whose versions differ, or that only one has ({len(others)}): {shown}")
+        lines.append(f"other packages whose versions differ, or that only one has: {few(others, N_SHOWN)}")
     return lines
 
 
@@ -161,7 +160,7 @@ def reproduce(original: Original, folder: Path, differing: Sequence[str]) -> Com
     overrides = run.tags.get(OVERRIDES_TAG, "").split()
     uri = original.config.tracking.uri
     command = armscan_command("runs", "reproduce", run.run_id, tracking=uri, trust=original.setup.needs_trust)
-    invocation = Invocation(folder, overrides, command, choices, None)
+    invocation = Invocation(folder, overrides, command, choices)
     try:
         with folder_lock(folder):
             tracked = start_tracking(original.config, invocation, original.setup, tags={OF_TAG: run.run_id})

@@ -26,7 +26,7 @@ from tests.support.tracked_runs import FEW
 def test_name_and_tags_of_a_run_are_of_its_environment(tmp_path, database, monkeypatch, words, name):
     monkeypatch.chdir(tmp_path)
     config, choices = compose_run([*FEW, "agent=random", *words])
-    tracked = start_tracking(config, Invocation(tmp_path, [], "", choices, None), set_up(config))
+    tracked = start_tracking(config, Invocation(tmp_path, [], "", choices), set_up(config))
     tracked.end("FINISHED")
     run = open_existing_store(database).get_run(tracked.run_id)
     assert run.info.run_name == name
@@ -39,7 +39,7 @@ def test_run_that_is_interrupted_while_it_is_created_is_closed(tmp_path, databas
     monkeypatch.setattr(TrackedRun, "log_datasets", Mock(side_effect=KeyboardInterrupt))
     config, choices = compose_run([*FEW, "agent=random"])
     with pytest.raises(KeyboardInterrupt):
-        start_tracking(config, Invocation(tmp_path, [], "", choices, None), set_up(config))
+        start_tracking(config, Invocation(tmp_path, [], "", choices), set_up(config))
     client = open_existing_store(database)
     (run,) = client.search_runs([each.experiment_id for each in client.search_experiments()])
     assert (run.info.status, run.data.tags["failure"]) == ("KILLED", "interrupted")
@@ -53,6 +53,6 @@ def test_new_run_keeps_nothing_of_an_earlier_one_in_its_folder(tmp_path, databas
     for name in (*left, "mine.txt"):
         (tmp_path / name).touch()
     config, choices = compose_run([*FEW, "agent=random"])
-    start_tracking(config, Invocation(tmp_path, [], "", choices, None), set_up(config)).end("FINISHED")
+    start_tracking(config, Invocation(tmp_path, [], "", choices), set_up(config)).end("FINISHED")
     assert not [name for name in left if (tmp_path / name).exists()]
     assert (tmp_path / "mine.txt").exists()

@@ -20,7 +20,7 @@ def test_figures_are_shown_before_the_video_and_the_export(tmp_path, monkeypatch
     monkeypatch.setattr(runner, "record_episode", noted)
     monkeypatch.setattr(build, "save_policy", noted)
     config, choices = compose_run(SMALL)
-    invocation = Invocation(tmp_path / "run", SMALL, "armscan run", choices, None)
+    invocation = Invocation(tmp_path / "run", SMALL, "armscan run", choices)
     invocation.folder.mkdir()
     runner.run_experiment(config, invocation)
     before_film, before_export = printed_before

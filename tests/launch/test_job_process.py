@@ -10,9 +10,11 @@ from types import SimpleNamespace
 import pytest
 
 from armscan.experiment import runner
-from armscan.experiment.job import Invocation, Job
+from armscan.experiment.job import Grid, Invocation, Job
 from armscan.launch import job_process
 from armscan.utils.processes import interruptions
+
+GRID = Grid(run_id="b", tracking={}, overrides=[], shared=[])
 
 
 @pytest.fixture
@@ -30,7 +32,7 @@ def test_job_whose_folder_is_another_jobs_fails_and_touches_nothing(tmp_path, mo
     monkeypatch.setattr(
         job_process.subprocess, "run", lambda *_, **__: started.append(1) or SimpleNamespace(returncode=0)
     )
-    jobs = [Job(number, f"a={number}", "", "b", tmp_path) for number in (0, 1, 0)]
+    jobs = [Job(number, f"a={number}", "", tmp_path, GRID) for number in (0, 1, 0)]
     for job in jobs:
         job_process.start_job(None, Invocation(tmp_path / "same", [], "", {}, job), job)
     # The first job may be started again, as after a requeue.
@@ -43,7 +45,7 @@ def test_job_whose_folder_is_another_jobs_fails_and_touches_nothing(tmp_path, mo
 
 def test_interrupt_after_the_end_of_a_job_leaves_its_outcome_as_it_is(tmp_path, monkeypatch, handlers):
     (tmp_path / "outcomes").mkdir()
-    job = Job(0, "a=1", "a=1", "b", tmp_path)
+    job = Job(0, "a=1", "a=1", tmp_path, GRID)
     invocation = Invocation(tmp_path, [], "", {}, job)
     metrics = {"test": {"mean_steps": 1.0}}
     monkeypatch.setattr(runner, "run_experiment", lambda *_: metrics)

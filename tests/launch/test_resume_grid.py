@@ -9,7 +9,7 @@ from armscan.config.compose import compose
 from armscan.config.defaults import to_plain
 from armscan.errors import ChangedVolumesError, ResumeError, UntrustedError
 from armscan.experiment.build import build_setup
-from armscan.experiment.job import Invocation, Job
+from armscan.experiment.job import Grid, Invocation, Job
 from armscan.launch.resume_grid import earlier_runs, run_again
 from armscan.tracking import TrackedRun
 from armscan.tracking.tags import GRID_TAG, OWN_CODE_TAG, PARENT_TAG, STUDY_TAG
@@ -19,6 +19,12 @@ from tests.support.stores import store_in
 from tests.support.tracked_runs import FEW
 
 SUMS = {"config.sha256": "a", "volumes.sha256": "b"}
+
+
+def job_of(number, grid, *, repeats, folder):
+    """Return a job of a grid that repeats another one, whose overrides were stored."""
+    grid = Grid(run_id=grid, tracking={}, overrides=[], shared=[], repeats=repeats, is_trusted=False)
+    return Job(number, "", "", folder, grid)
 
 
 def test_earlier_run_is_of_the_repeated_grid_and_never_of_a_study_or_another_grid(tmp_path, database):
@@ -42,7 +48,7 @@ def test_earlier_run_is_of_the_repeated_grid_and_never_of_a_study_or_another_gri
     run_with(**SUMS, **{PARENT_TAG: grid("seed=1,2", uri)})
     run_with(**SUMS, **{PARENT_TAG: run_with(**{STUDY_TAG: "s"}), STUDY_TAG: "s"})
     run_with(**SUMS | {"volumes.sha256": "c"}, **{PARENT_TAG: repeated})
-    job = Job(0, "", "", now, tmp_path, repeats=repeated, is_trusted=False)
+    job = job_of(0, now, repeats=repeated, folder=tmp_path)
     found = [run.info.run_id for run in earlier_runs(client, experiment_id, SUMS, job)]
     assert found[0] == ours
     assert {*found} == {ours, alone, of_repetition}
@@ -68,7 +74,7 @@ def test_grid_goes_on_with_the_same_volumes_alone(tmp_path, database, change):
     ) as run:
         if change != "lost":
             run.log_files(tmp_path / VOLUMES_FILE)
-    job = Job(1, "", "", "2" * 32, tmp_path, repeats="1" * 32, is_trusted=False)
+    job = job_of(1, "2" * 32, repeats="1" * 32, folder=tmp_path)
     begun = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("armscan.launch.resume_grid.run_experiment", lambda *_: begun.append(1))
@@ -88,7 +94,7 @@ def test_only_runs_of_the_grid_must_have_the_same_own_code(tmp_path, database, m
     tags = {OWN_CODE_TAG: "parts:01", PARENT_TAG: ("1" if is_of_grid else "3") * 32}
     other = client.create_run(experiment_id, name="n", tags=tags)
     client.set_terminated(other.info.run_id)
-    job, begun = Job(0, "", "", "2" * 32, tmp_path, repeats="1" * 32, is_trusted=False), []
+    job, begun = job_of(0, "2" * 32, repeats="1" * 32, folder=tmp_path), []
     monkeypatch.setattr("armscan.launch.resume_grid.earlier_runs", lambda *_: [client.get_run(other.info.run_id)])
     monkeypatch.setattr("armscan.launch.resume_grid.run_experiment", lambda *_: begun.append(1))
     expected = pytest.raises(ResumeError, match="other code of parts") if is_of_grid else contextlib.nullcontext()
@@ -99,6 +105,6 @@ def test_only_runs_of_the_grid_must_have_the_same_own_code(tmp_path, database, m
 
 def test_job_of_a_stored_command_line_builds_no_class_of_others(tmp_path):
     config = compose(["+agent.agent._target_=joblib.load"])
-    job = Job(3, "", "", "0" * 32, tmp_path, repeats="1" * 32, is_trusted=False)
+    job = job_of(3, "0" * 32, repeats="1" * 32, folder=tmp_path)
     with pytest.raises(UntrustedError, match=r"job 3: its configuration builds agent.agent by 'joblib.load'"):
         run_again(config, Invocation(tmp_path, [], "", {}, job), job)

@@ -32,6 +32,12 @@ def test_difference_names_the_step_where_it_is_largest():
     assert str(found) == text
 
 
+def test_difference_from_a_value_that_was_nan_is_infinite():
+    found = difference("a", {1: math.nan, 2: 1.0}, {1: 1.0, 2: 1.0})
+    assert (found.largest, found.relative, found.is_same) == (math.inf, math.inf, False)
+    assert "by inf at step 1, where nan became 1" in str(found)
+
+
 def test_comparison_says_what_differs_most_first_and_what_is_missing_before_all():
     parts = (
         difference("little", {1: 100.0}, {1: 101.0}),

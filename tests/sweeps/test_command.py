@@ -21,6 +21,10 @@ from armscan.config.error_messages import one_line_message
 from armscan.errors import ArmscanError, InvalidValueError, StudyError
 from armscan.sweeps.command import run_study
 from armscan.sweeps.storage.storage import open_storage
+from armscan.tracking import open_existing_store
+from armscan.tracking.tags import JOB_TAG
+from armscan.utils.files import sha256
+from armscan.utils.run_files import RESULT_SHA256_TAGS, RUN_FILE
 from tests.reports.conftest import rows
 from tests.support import FEW_VOLUMES
 from tests.support.processes import processes_in, start_run
@@ -65,6 +69,10 @@ def workers_in(folder):
     return [json.loads(file.read_text())["pid"] for file in files]
 
 
+def run_id_in(folder):
+    return json.loads((folder / RUN_FILE).read_text())["run_id"]
+
+
 def check_result(folder):
     """Compare the result in the report with its episodes, by NumPy alone."""
     report = [sys.executable, "-m", "armscan", "report", "--study", "sac_y", "--out", "report"]
@@ -75,6 +83,9 @@ def check_result(folder):
     for trial in trials_of(folder, "sac_y-judged"):
         name = "control" if trial.user_attrs["judged"] < 0 else str(trial.user_attrs["judged"])
         (file,) = (folder / trial.user_attrs["folder"]).glob("seed_*/evaluation.json")
+        tags = open_existing_store(f"sqlite:///{folder}/mlruns.db").get_run(run_id_in(file.parent)).data.tags
+        assert tags[RESULT_SHA256_TAGS[file.name]] == sha256(file.read_bytes())
+        assert JOB_TAG not in tags
         of_seed = json.loads(file.read_text())["test volumes"]["episodes"]
         episodes.setdefault(name, []).extend(SimpleNamespace(**each) for each in of_seed)
     assert "control" in episodes

@@ -37,7 +37,9 @@ from armscan.tracking.sync import _upload_pending, sync
 from armscan.tracking.tags import DESCRIPTION_TAG, VERSION_TAG
 from armscan.tracking.uploader import upload
 from armscan.training import EpochReport, TrainingResult
+from armscan.utils.files import sha256
 from armscan.utils.processes import ProcessInfo
+from armscan.utils.run_files import RESULT_SHA256_TAGS
 from tests.support.stores import store_in
 from tests.support.waiting import wait_until
 from tests.training.test_train import evaluation_of
@@ -85,10 +87,14 @@ def test_tracked_run_keeps_parameters_curves_results_and_files(store, tmp_path):
             RunResult({"test volumes": evaluation_of(2, 4)}, {"random": evaluation_of(9)}),
             folder,
         )
+        draw_learning_curve(REPORTS, folder / "learning_curve.png", title="n")
+        tracked.log_results(folder)
     run = client.get_run(tracked.run_id)
     assert run.info.status == "FINISHED"
     assert run.data.params == {"agent.lr": "0.1", "agent.sizes": "[1, 2]", "seed": "3"}
     assert run.data.tags["overrides"] == "seed=3"
+    for name, tag in RESULT_SHA256_TAGS.items():
+        assert run.data.tags[tag] == sha256((folder / name).read_bytes())
     assert run.data.tags["git.commit"] == code_state().tags["git.commit"]
     assert run.data.metrics["test_volumes/mean_steps"] == 3.0
     assert run.data.metrics["test_volumes/on_plane_5mm_10deg"] == 1.0

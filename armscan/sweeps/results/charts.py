@@ -17,9 +17,9 @@ from plotly.graph_objects import Figure, Scatter
 
 from armscan.reports.chart_style import BLUE, GREY, ORANGE, RATE_AXIS, RED, line_mode
 from armscan.reports.html import chart
-from armscan.sweeps.results.csv_tables import comparable_trials, study_of_one_objective
+from armscan.sweeps.results.csv_tables import study_of_one_objective
 from armscan.sweeps.scheduling.population import searched_values
-from armscan.sweeps.scheduling.state import is_feasible
+from armscan.sweeps.scheduling.state import comparable_trials, is_feasible
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.reports import reports_of
 from armscan.training.metric_display import is_rate, title_of

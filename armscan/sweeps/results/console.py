@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 import os
-import sys
 from collections.abc import Mapping, Sequence
 
 from rich.table import Table
 from rich.text import Text
 
 from armscan.config.command_hints import armscan_command
-from armscan.errors import printable
+from armscan.errors import print_error, printable
 from armscan.experiment.console import print_result_table, print_where_to_look
 from armscan.sweeps.results.difference import HOW
 from armscan.sweeps.results.final_results import final_table
@@ -43,14 +42,14 @@ def print_result(opened: OpenedStudy) -> int:
         print_sentence(printable(f"the study was stopped {stopped}; the same command resumes it"))
         return 0
     if wrong := scheduler.failure_reason(state):
-        print(printable(f"error: {wrong}"), file=sys.stderr)
+        print_error(wrong)
         return 1
     if scheduler.end_reason(state) is None:
         unfinished = (
             f"the workers of this command have ended, but only {len(state.finished)} of {settings.n_trials} trials "
             f"have finished: their logs in {opened.folder / 'workers'} say why; the same command resumes the study"
         )
-        print(printable(f"error: {unfinished}"), file=sys.stderr)
+        print_error(unfinished)
         return os.EX_TEMPFAIL
     if scheduler.termination is not None and (ended := scheduler.termination.reason):
         told = f"the study has ended early: {ended}; to continue it, change study.n_trials or study.terminator"
@@ -105,8 +104,7 @@ def _print_final_results(opened: OpenedStudy, final: FinalEvaluation) -> int:
         if failed := phase.scheduler.failures(phase.scheduler.state()):
             unfinished, reason = 1, failed[0].user_attrs.get(FAILURE)
             again = "; fix the cause, and the same command trains them again" if phase.name in blocked else ""
-            told = f"error: {counted(len(failed), 'training')} of {phase.name} failed: {reason}{again}"
-            print(printable(told), file=sys.stderr)
+            print_error(f"{counted(len(failed), 'training')} of {phase.name} failed: {reason}{again}")
     candidates = candidates_of(final)
     if candidates:
         objective = objective_of(final)
@@ -120,7 +118,7 @@ def _print_final_results(opened: OpenedStudy, final: FinalEvaluation) -> int:
         code, reason = 1, f"no {nothing}"
         if not final.has_begun_all or final.n_unjudged:
             code, reason = unfinished, "trainings are missing; the same command resumes the study"
-        print(f"error: no final evaluation, because {reason}", file=sys.stderr)
+        print_error(f"no final evaluation, because {reason}")
         return code
     if judgement.differences:
         _print_rows(judgement.compared, [each.row() for each in judgement.differences])
@@ -130,8 +128,7 @@ def _print_final_results(opened: OpenedStudy, final: FinalEvaluation) -> int:
         print_sentence(f"{name}: {settings or NOTHING_SEARCHED}")
     print_sentence(f"result: {judgement.result}")
     if n_left := final.n_unjudged:
-        left = f"trainings on the test volumes are missing ({n_left}); the same command resumes the study"
-        print(f"error: {left}", file=sys.stderr)
+        print_error(f"trainings on the test volumes are missing ({n_left}); the same command resumes the study")
         return os.EX_TEMPFAIL
     return 0
 

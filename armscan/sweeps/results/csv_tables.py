@@ -16,7 +16,7 @@ from armscan.sweeps.results.final_results import ConfigResult
 from armscan.sweeps.results.judgement import Judgement
 from armscan.sweeps.results.selection import Candidate, score_rows
 from armscan.sweeps.scheduling.population import searched_values
-from armscan.sweeps.scheduling.state import TEST_PREFIX, is_feasible, seconds_of, was_retried
+from armscan.sweeps.scheduling.state import TEST_PREFIX, comparable_trials, is_feasible, seconds_of, was_retried
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.attribute_names import (
     ENV_STEPS,
@@ -161,11 +161,6 @@ def _importance_rows(study: optuna.Study, objectives: Sequence[str]) -> list[Row
             shares = get_param_importances(alone, evaluator=PedAnovaImportanceEvaluator())
         rows += [{"objective": objective, "key": key, "importance": share} for key, share in shares.items()]
     return rows
-
-
-def comparable_trials(trials: Iterable[FrozenTrial]) -> list[FrozenTrial]:
-    """Return the completed trials that violate no constraint."""
-    return [trial for trial in trials if trial.state == TrialState.COMPLETE and is_feasible(trial)]
 
 
 def study_of_one_objective(trials: Iterable[FrozenTrial], number: int, direction: StudyDirection) -> optuna.Study:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -152,3 +152,8 @@ def env_steps_of(trial: FrozenTrial) -> int:
 def is_feasible(trial: FrozenTrial) -> bool:
     """Return whether a trial violates no constraint of its study."""
     return all(violation <= 0 for violation in trial.constraints.values())
+
+
+def comparable_trials(trials: Iterable[FrozenTrial]) -> list[FrozenTrial]:
+    """Return the completed trials that violate no constraint."""
+    return [trial for trial in trials if trial.state == TrialState.COMPLETE and is_feasible(trial)]

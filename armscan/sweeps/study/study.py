@@ -18,7 +18,7 @@ from armscan.config.defaults import ADDED, NOT_COMPARED, to_plain
 from armscan.config.legacy import migrate, renamed
 from armscan.config.own_code import own_code
 from armscan.config.trust import classes_in_groups
-from armscan.errors import StudyError
+from armscan.errors import StudyError, few
 from armscan.sweeps.scheduling.population import searched_values
 from armscan.sweeps.scheduling.state import is_feasible, loss_signs
 from armscan.sweeps.space.parameter import hydra_literal
@@ -39,6 +39,8 @@ from armscan.sweeps.study.settings import StudySettings
 from armscan.tracking import flatten
 
 N_SHOWN = 5
+# Instead of the value of a key that a configuration does not have.
+NOT_THERE = "not there"
 CONSTRAINTS = "study.constraints"
 # Among the compared settings: the size and interval of a population, the overrides below a searched group, and
 # checksums of the volumes and of the modules of own classes. A study that lacks one, as those of earlier versions do,
@@ -185,6 +187,12 @@ def fixed_of(study: optuna.Study, wanted: Mapping[str, Any]) -> tuple[dict[str, 
     return _comparable(there, wanted[FIXED])
 
 
+def differing(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """Return the values that differ between two fixed configurations; `NOT_THERE` for a key that one does not have."""
+    pairs = {key: (before.get(key, NOT_THERE), now.get(key, NOT_THERE)) for key in {**before, **now}}
+    return {key: (then, today) for key, (then, today) in pairs.items() if then != today}
+
+
 def _comparable(before: Mapping[str, Any], now: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return two fixed configurations without what only one of them compares."""
     alone = {key for key in before.keys() ^ now.keys() if key.startswith(LATER)}
@@ -251,9 +259,7 @@ def _check_same(settings: StudySettings, study: optuna.Study, wanted: Mapping[st
 
 
 def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    keys = [key for key in {**before, **now} if before.get(key) != now.get(key) or (key in before) != (key in now)]
-    shown = [f"{key} was {before.get(key, 'not there')}, is {now.get(key, 'not there')}" for key in keys[:N_SHOWN]]
-    return ", ".join(shown) + (f", and {len(keys) - N_SHOWN} others" if len(keys) > N_SHOWN else "")
+    return few([f"{key} was {then}, is {today}" for key, (then, today) in differing(before, now).items()], N_SHOWN)
 
 
 def best_trials(study: optuna.Study, n_best: int) -> list[FrozenTrial]:

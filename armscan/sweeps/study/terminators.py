@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from statistics import fmean, variance
 from typing import Protocol
 
@@ -11,10 +11,10 @@ import numpy as np
 import optuna
 from optuna.exceptions import ExperimentalWarning
 from optuna.study import StudyDirection
-from optuna.trial import FrozenTrial, TrialState
+from optuna.trial import FrozenTrial
 
 from armscan.errors import InvalidValueError
-from armscan.sweeps.scheduling.state import StudyState, is_feasible, loss_signs
+from armscan.sweeps.scheduling.state import StudyState, comparable_trials, loss_signs
 from armscan.sweeps.storage.attribute_names import SEEDS
 from armscan.sweeps.study.pruners import front_numbers
 from armscan.utils.validation import check_int
@@ -67,7 +67,7 @@ class BelowSeedNoise:
 
     def reason(self, study: optuna.Study, objectives: Sequence[str], state: StudyState) -> str | None:
         """See `Terminator.reason`."""
-        trials = _completed((*state.taken, *state.finished))
+        trials = comparable_trials((*state.taken, *state.finished))
         if len(trials) < self._min_trials or (noise := seed_noise(trials, objectives[0], study.direction)) is None:
             return None
         # Deferred: it loads torch.
@@ -107,8 +107,8 @@ class Stagnation:
 
     def reason(self, study: optuna.Study, objectives: Sequence[str], state: StudyState) -> str | None:
         """See `Terminator.reason`."""
-        own = sorted(_completed(state.finished), key=lambda trial: (str(trial.datetime_complete), trial.number))
-        trials = [*_completed(state.taken), *own]
+        own = sorted(comparable_trials(state.finished), key=lambda trial: (str(trial.datetime_complete), trial.number))
+        trials = [*comparable_trials(state.taken), *own]
         n_before = len(trials) - self._n_trials
         if len(own) < self._n_trials or not n_before:
             return None
@@ -147,7 +147,3 @@ def seed_noise(trials: Sequence[FrozenTrial], objective: str, direction: StudyDi
     of_trials = [[each[objective] for each in trial.user_attrs.get(SEEDS, {}).values()] for trial in better]
     variances = [variance(values) for values in of_trials if len(values) > 1]
     return fmean(variances) ** 0.5 if variances else None
-
-
-def _completed(trials: Iterable[FrozenTrial]) -> list[FrozenTrial]:
-    return [trial for trial in trials if trial.state == TrialState.COMPLETE and is_feasible(trial)]

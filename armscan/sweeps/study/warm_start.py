@@ -34,7 +34,7 @@ from armscan.sweeps.storage.attributes import FINAL_SUFFIXES, check_trials
 from armscan.sweeps.storage.reports import REPORT
 from armscan.sweeps.storage.storage import Storage, existing_storage
 from armscan.sweeps.study.settings import StudySettings
-from armscan.sweeps.study.study import best_trials, comparable_settings, config_changes, fixed_of, is_ours
+from armscan.sweeps.study.study import best_trials, comparable_settings, config_changes, differing, fixed_of, is_ours
 from armscan.utils.text import counted
 
 PRESET, SOURCE = "preset {}", "study {}"
@@ -195,13 +195,12 @@ def _difference(source: optuna.Study, wanted: Mapping[str, Any]) -> str | None:
     if [*there[OBJECTIVES].items()] != [*wanted[OBJECTIVES].items()]:
         return f"its objectives are {' and '.join(f'{way} {name}' for name, way in there[OBJECTIVES].items())}"
     searched = tuple(f"{key}." for key in (*renamed(there[SPACE]), *wanted[SPACE]))
-    before, now = fixed_of(source, wanted)
-    keys = [key for key in {**before, **now} if not f"{key}.".startswith(searched)]
-    different = [key for key in keys if before.get(key) != now.get(key)]
-    if not different:
+    different = differing(*fixed_of(source, wanted))
+    found = [(key, pair) for key, pair in different.items() if not f"{key}.".startswith(searched)]
+    if not found:
         return None
-    shown = f"its {different[0]} is {before.get(different[0])}, and not {now.get(different[0])}"
-    return shown + (f" ({len(different) - 1} others differ)" if len(different) > 1 else "")
+    key, (then, today) = found[0]
+    return f"its {key} is {then}, and not {today}" + (f" ({len(found) - 1} others differ)" if len(found) > 1 else "")
 
 
 def _is_opposed(source: optuna.Study, wanted: Mapping[str, Any]) -> bool:

@@ -25,10 +25,10 @@ from armscan.experiment.build import (
     on_plane_of,
     set_up,
 )
-from armscan.experiment.job import Invocation, Job
+from armscan.experiment.job import Invocation
 from armscan.experiment.provenance import place_tags, start_tracking, volume_tags
 from armscan.experiment.results import RunResult
-from armscan.experiment.runner import log_result, train_agent
+from armscan.experiment.runner import keep_results, train_agent
 from armscan.sweeps.scheduling.limits import LimitReachedError
 from armscan.sweeps.scheduling.state import TEST_PREFIX
 from armscan.sweeps.tasks.attempt import TAKEN_OVER, Attempt, over_seeds, volumes_of
@@ -127,8 +127,7 @@ def _evaluate_on_test(
 ) -> dict[str, float]:
     """Evaluate a trained agent and the baselines, and store the results; return the metrics on the test volumes."""
     reached = RunResult.of(setup, result)
-    reached.write(folder, title=tracked.name)
-    log_result(tracked, result, reached)
+    keep_results(tracked, result, reached, folder)
     tested = reached.evaluations[TEST]
     attempt.keep_episodes({TEST: tested, **reached.baselines})
     agent, seed = setup.agent, VIDEO_SEED + setup.seed
@@ -237,9 +236,8 @@ def _start_or_resume(
         elif not any(name.startswith("validation/") for name in run.data.metrics):
             # It was interrupted before the end of its first epoch.
             return setup, reopen(), None
-    job = Job(attempt.trial.number, " ".join(attempt.overrides), "", attempt.run_id, attempt.study_folder)
-    invocation = Invocation(folder, attempt.overrides, attempt.command, choices, job)
-    tracked = start_tracking(config, invocation, setup, tags=attempt.tags, retry_s=RETRY_S)
+    invocation = Invocation(folder, attempt.overrides, attempt.command, choices)
+    tracked = start_tracking(config, invocation, setup, parent_id=attempt.run_id, tags=attempt.tags, retry_s=RETRY_S)
     atomic_write(folder / RUN_FILE, json.dumps({"run_id": tracked.run_id}))
     return setup, tracked, None
 

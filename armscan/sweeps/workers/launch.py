@@ -15,7 +15,7 @@ from pathlib import Path
 from armscan.config.command_hints import armscan_command
 from armscan.config.defaults import TRACKING_URI
 from armscan.config.sources import working_folder
-from armscan.errors import ArmscanError, reason_of
+from armscan.errors import ArmscanError, print_error, reason_of
 from armscan.launch.launchers import ON_THIS_MACHINE, launcher_error, prepare_launcher
 from armscan.sweeps.results.judgement import judge
 from armscan.sweeps.results.progress import progress_display
@@ -114,7 +114,7 @@ def _launch_here(launch: Callable[[], object]) -> None:
             launch()
     # Its trial is requeued; the result says that the study can be resumed.
     except UncompletedJobError as error:
-        print(f"error: a worker's supervisor was killed: {reason_of(error)}", file=sys.stderr)
+        print_error(f"a worker's supervisor was killed: {reason_of(error)}")
 
 
 def _launch_elsewhere(monitor: StudyMonitor, folder: Path, launcher: str, launch: Callable[[], object]) -> None:
@@ -129,7 +129,7 @@ def _launch_elsewhere(monitor: StudyMonitor, folder: Path, launcher: str, launch
         monitor.wait_for_requeue()
     # An error from a worker's machine, raised after all workers have ended.
     except ArmscanError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print_error(str(error))
     # Any error of a launcher, which may fail for one cancelled job while all others continue.
     except Exception as error:
         failed = launcher_error(launcher, error)
