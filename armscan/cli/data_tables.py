@@ -12,7 +12,7 @@ from rich.text import Text
 from armscan.config.command_hints import armscan_command
 from armscan.errors import few, listed
 from armscan.utils.console import WHOLE_CHARS, print_sentence, print_table, wide_console
-from armscan.utils.text import counted
+from armscan.utils.text import MISSING, counted
 
 if TYPE_CHECKING:
     from armscan.anatomy import FoundPlane
@@ -101,7 +101,7 @@ def _tissue_table(report: VolumeReport) -> Table:
         sources = ", ".join(f"{each.source} ({each.n_voxels})" for each in report.stored.found if each.label == value)
         is_there = tissue in report.n_voxels
         amounts = (str(report.n_voxels[tissue]), f"{report.tissue_mm3[tissue]:.0f}") if is_there else ()
-        table.add_row(tissue, Text(sources or "-"), *amounts)
+        table.add_row(tissue, Text(sources or MISSING), *amounts)
     if report.stored.missing:
         table.add_row("missing", Text(shown(report.stored.missing)))
     return table
@@ -133,13 +133,14 @@ def print_planes(options: LabellingOptions, labelled: Sequence[tuple[LabelVolume
     rows = []
     for _, plane in labelled:
         rz, rx, tx, ty = plane.action.to_array()
+        spread = MISSING if plane.spread is None else ", ".join(f"{each:.0f}" for each in plane.spread)
         rows.append(
             [
                 f"{plane.score:.3f}",
                 ", ".join(map(str, plane.counts)),
                 f"{rz:.1f}, {rx:.1f}",
                 f"{tx:.1f}, {ty:.1f}",
-                "-" if plane.spread is None else "≥ " * plane.is_cut + "{:.0f}, {:.0f}, {:.0f}".format(*plane.spread),
+                f"≥ {spread}" if plane.is_cut else spread,
             ]
         )
     print_sentence(f"planes written into the manifest of {options.data}")

@@ -21,7 +21,7 @@ from armscan.training.episode_results import metric_prefix
 from armscan.training.headline import ABOVE_RANDOM, beside_random, headline
 from armscan.training.metric_display import interval_text
 from armscan.training.metrics import LEAST_SURE, NOT_STARTED_SOLVED, SUREST
-from armscan.utils.text import formatted
+from armscan.utils.text import MISSING, formatted
 
 TOTAL = "all volumes"
 AGENT = "agent"
@@ -196,7 +196,7 @@ def _untimed(metrics: MetricEstimates) -> MetricEstimates:
 
 def _cell(estimate: Estimate, form: str, *, apart: str) -> str:
     if math.isnan(estimate.value):
-        return "-"
+        return MISSING
     return f"{formatted(form, estimate.value)}{apart}{interval_text(estimate, form)}"
 
 

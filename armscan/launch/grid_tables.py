@@ -32,7 +32,7 @@ from armscan.training.headline import ABOVE_RANDOM, headline
 from armscan.training.result_table import with_baselines
 from armscan.utils.files import atomic_write
 from armscan.utils.run_files import ID_CHARS, RESULTS_PAGE
-from armscan.utils.text import counted
+from armscan.utils.text import MISSING, counted
 
 if TYPE_CHECKING:
     from mlflow.entities import Run
@@ -69,7 +69,7 @@ def jobs_table(outcomes: Mapping[str, JobOutcome], run_ids: Mapping[str, str], *
     results = with_baselines(tested, baselines)
     ended = {None: "done", INTERRUPTED: INTERRUPTED}
     facts = {
-        "run": [run_ids.get(number, "-")[:ID_CHARS] for number in outcomes],
+        "run": [run_ids.get(number, MISSING)[:ID_CHARS] for number in outcomes],
         "overrides": [outcome.varied for outcome in outcomes.values()],
         "outcome": [ended.get(outcome.failure, "failed") for outcome in outcomes.values()],
     }

@@ -33,7 +33,7 @@ from armscan.training.baselines import RANDOM
 from armscan.training.headline import headline
 from armscan.training.metric_display import title_of
 from armscan.training.result_table import with_baselines
-from armscan.utils.text import counted
+from armscan.utils.text import MISSING, counted
 
 HOW_CURVES = (
     "On the validation volumes, after each epoch. Thick: the mean of the seeds of a group. Band: its 95 % interval "
@@ -137,7 +137,7 @@ def _summary(groups: Sequence[Group]) -> str:
 
 def _seed_and_fold(training: TrackedTraining) -> str:
     """Return the seed of a training, and the fold that it was tested on."""
-    seed = training.seed or "–"
+    seed = training.seed or MISSING
     return seed if training.fold is None else f"{seed}, fold {training.fold}"
 
 
@@ -257,6 +257,6 @@ def _span(values: Sequence[float]) -> str:
     """Return the mean of the known values, with the lowest and the highest if they differ."""
     known = [value for value in values if not math.isnan(value)]
     if not known:
-        return "–"
+        return MISSING
     low, high, mean = min(known), max(known), sum(known) / len(known)
     return f"{mean:,.0f}" + (f" ({low:,.0f}–{high:,.0f})" if high > low else "")

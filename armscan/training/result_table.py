@@ -18,13 +18,12 @@ from rich.text import Text
 from armscan.stats.bootstrap import Estimate
 from armscan.training.metric_display import LEADING, OLDER, QUANTITIES, Quantity, interval_text
 from armscan.training.metrics import MetricEstimates
-from armscan.utils.text import counted, formatted, markdown_table
+from armscan.utils.text import MISSING, counted, formatted, markdown_table
 
 # Maximum number of results that are columns side by side; with more, each is a line.
 MAX_ABREAST = 6
 # Characters between two columns.
 PADDING_CHARS = 2
-MISSING = "–"
 HOW = (
     "95 % intervals resample seeds, subjects and episodes. If all episodes of a rate are equal, its interval is "
     "Wilson's, which takes episodes as independent. Means include failed episodes; the IQM is the mean of the middle "

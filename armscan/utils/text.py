@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 # Short form of a rate.
 PERCENT = "{:.0%}"
 # Shown in place of a value that there is none of.
-MISSING = "-"
+MISSING = "–"
 
 
 def formatted(form: str, value: float) -> str:

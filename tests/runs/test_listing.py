@@ -249,7 +249,7 @@ def test_show_of_a_parent_offers_nothing_that_it_cannot_do(family, answer):
 
 
 def test_times_are_readable():
-    assert [format_duration(s) for s in (None, 5, 65, 3605, 100_000)] == ["-", "0:05", "1:05", "1:00:05", "1d 3h"]
+    assert [format_duration(s) for s in (None, 5, 65, 3605, 100_000)] == ["–", "0:05", "1:05", "1:00:05", "1d 3h"]
 
 
 def test_run_that_goes_on_again_has_no_duration(answer, make_run, store, aged, listed):

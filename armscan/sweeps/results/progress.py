@@ -36,6 +36,7 @@ from armscan.sweeps.study.settings import StudySettings
 from armscan.sweeps.study.study import best_trials
 from armscan.utils.console import print_sentence
 from armscan.utils.retry import no_retry
+from armscan.utils.text import MISSING
 
 REFRESH_S = 2.0
 
@@ -119,8 +120,8 @@ def _table(opened: OpenedStudy) -> Table:
     for trial in (*state.running, *(trial for _, of_final in finals for trial in of_final.running)):
         lease, finalist = trial.user_attrs.get(LEASE, {}), trial.user_attrs.get(FINALIST)
         name = str(trial.number) if finalist is None else f"{name_of(finalist)}, final"
-        mean_return = f"{lease['return']:.2f}" if "return" in lease else "-"
-        shown = (lease.get("seed", "-"), lease.get(ENV_STEPS, "-"), mean_return)
+        mean_return = f"{lease['return']:.2f}" if "return" in lease else MISSING
+        shown = (lease.get("seed", MISSING), lease.get(ENV_STEPS, MISSING), mean_return)
         worker = printable(lease.get("worker", "?").rpartition("/")[2])
         table.add_row(Text(worker), name, *map(str, shown))
     return table

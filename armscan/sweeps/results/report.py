@@ -37,7 +37,7 @@ from armscan.sweeps.study.final_eval import FinalEvaluation
 from armscan.sweeps.study.study import best_trials
 from armscan.training.metric_display import title_of, value_text
 from armscan.utils.run_files import ID_CHARS
-from armscan.utils.text import counted
+from armscan.utils.text import MISSING, counted
 
 # Names of trial states for users.
 STATES = {"complete": "finished", "fail": "failed"}
@@ -120,10 +120,10 @@ def _running(running: Sequence[FrozenTrial]) -> str:
     rows = [
         {
             "trial": trial.number,
-            "worker": str(lease.get("worker", "–")),
-            "seed": lease.get("seed", "–"),
+            "worker": str(lease.get("worker", MISSING)),
+            "seed": lease.get("seed", MISSING),
             "environment steps": f"{env_steps_of(trial):,}",
-            "return, mean": lease.get("return", "–"),
+            "return, mean": lease.get("return", MISSING),
             **_settings(trial.params),
         }
         for trial, lease in ((each, each.user_attrs.get(LEASE, {})) for each in running)

@@ -18,7 +18,7 @@ from armscan.training.metric_display import COSTS, leading_among, title_of, valu
 from armscan.training.metrics import SEEDS
 from armscan.utils.files import sha256
 from armscan.utils.log import log
-from armscan.utils.text import markdown_table
+from armscan.utils.text import MISSING, markdown_table
 
 # Where `armscan ui` serves the runs of a local store, unless it is given another port.
 LOCAL_UI = f"http://127.0.0.1:{MLFLOW_PORT}"
@@ -66,7 +66,7 @@ def table_of_seeds(of_seeds: Mapping[int, Mapping[str, float]]) -> str:
     rows = []
     for name in names:
         values = (metrics.get(name, math.nan) for metrics in of_seeds.values())
-        rows.append([title_of(name), *("–" if math.isnan(value) else value_text(name, value) for value in values)])
+        rows.append([title_of(name), *(MISSING if math.isnan(value) else value_text(name, value) for value in values)])
     return markdown_table(["validation at the best epoch; cost in all", *(f"seed {seed}" for seed in of_seeds)], rows)
 
 
