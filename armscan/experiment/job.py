@@ -19,7 +19,7 @@ from hydra.types import RunMode
 
 from armscan.config.command_hints import kept_command
 from armscan.config.defaults import CHOICES
-from armscan.errors import FolderInUseError, FolderTakenError, InvalidValueError
+from armscan.errors import FolderInUseError, FolderTakenError, InvalidValueError, reason_of
 from armscan.utils.files import atomic_write, sha256
 from armscan.utils.processes import ProcessInfo
 from armscan.utils.run_files import CONFIG_FILE, LOCK_FILE, OUTBOX_FOLDER, OUTBOX_SUFFIXES, RUN_ID_PATTERN
@@ -76,10 +76,17 @@ class Grid:
 
     @classmethod
     def read(cls, folder: Path) -> Self:
-        """Read the grid of a folder."""
-        values = json.loads((folder / GRID_FILE).read_text())
-        launcher = ProcessInfo.of(values["launcher"]) if values["launcher"] else None
-        return cls(**values | {"launcher": launcher})
+        """Read the grid of a folder.
+
+        Raises:
+            InvalidValueError: If its file is damaged.
+        """
+        try:
+            values = json.loads((file := folder / GRID_FILE).read_text())
+            launcher = ProcessInfo.of(values["launcher"]) if values["launcher"] else None
+            return cls(**values | {"launcher": launcher})
+        except (ValueError, TypeError, KeyError) as error:
+            raise InvalidValueError(f"{file}: is damaged, its jobs cannot run: {reason_of(error)}") from error
 
     def write(self, folder: Path) -> None:
         """Write the grid into its folder."""

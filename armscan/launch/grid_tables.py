@@ -22,6 +22,7 @@ from armscan.experiment.results import TITLES, few_subjects
 from armscan.launch.folds_table import AGENT, ALL_FOLDS, folds_table
 from armscan.launch.grid_jobs import jobs_of
 from armscan.reports.html import page
+from armscan.tracking.git import CODE_TAGS
 from armscan.tracking.outbox import now_ms
 from armscan.tracking.tags import FOLDER_TAG, JOB_TAG, OWN_CODE_TAG
 from armscan.tracking.uploader import set_description
@@ -101,6 +102,8 @@ def keep_tables(
         finished = [run for run in runs if outcomes[run.data.tags[JOB_TAG]].failure is None]
         mixed = mixed_modules(run.data.tags.get(OWN_CODE_TAG) for run in finished)
         on_code = [f"the jobs used different versions of {few(mixed)} (tag {OWN_CODE_TAG})"] if mixed else []
+        if len({tuple(run.data.tags.get(tag) for tag in CODE_TAGS) for run in finished}) > 1:
+            on_code.append(f"the jobs used different versions of armscan's code (tags {', '.join(CODE_TAGS)})")
         if planned is not None and (pooled := _pooled_folds(grid, outcomes, finished, planned)) is not None:
             of_folds, notes = pooled[0], [*pooled[1], *on_code]
             print_result_table(f"{next(iter(of_folds.results)).split(', ')[1]} (test)", of_folds, notes)

@@ -17,11 +17,11 @@ from omegaconf import DictConfig, OmegaConf
 
 from armscan.config.command_hints import armscan_command, resume_command, run_command
 from armscan.config.credentials import check_address
-from armscan.config.defaults import TRACKING_URI, to_plain
+from armscan.config.defaults import RESUME, TRACKING_URI, to_plain
 from armscan.config.error_messages import one_line_message
 from armscan.config.task import have_same_task
 from armscan.config.trust import needs_trust, untrusted_override
-from armscan.errors import InvalidValueError, TrackingError, print_error
+from armscan.errors import InvalidValueError, ResumeError, TrackingError, print_error
 from armscan.experiment.job import (
     INTERRUPTED,
     NO_OUTCOME,
@@ -32,7 +32,16 @@ from armscan.experiment.job import (
 )
 from armscan.launch.grid_jobs import shared_overrides
 from armscan.launch.launchers import LAUNCHER, ON_THIS_MACHINE, check_launcher, prepare_launcher
-from armscan.tracking import TrackingSettings, TrackingStore, begin_outbox, code_state, open_store, record_end, sync
+from armscan.tracking import (
+    TrackingSettings,
+    TrackingStore,
+    begin_outbox,
+    code_state,
+    open_store,
+    record_end,
+    sync,
+    upload_pending,
+)
 from armscan.tracking.sync import PROCESS_DIED
 from armscan.tracking.tags import (
     CONTINUED_TAG,
@@ -62,6 +71,7 @@ class Multirun(Callback):
     """
 
     folder: Path | None = None
+    grid: Grid | None = None
     launcher: str | None = None
     # Of the parent run; open while the jobs run.
     outbox: Outbox | None = None
@@ -98,6 +108,10 @@ class Multirun(Callback):
         TrackingSettings.read("tracking", tracking)
         overrides = list(config.hydra.overrides.task)
         store, experiment_id = open_store(**tracking)
+        if Multirun.repeats is not None:
+            _check_not_continued(store, experiment_id, Multirun.repeats)
+        # Ends what dead processes have left running, such as the grid that is repeated.
+        upload_pending(store)
         (folder / OUTCOME_FOLDER).mkdir(parents=True)
         command = " ".join(overrides)
         # Includes the tracking URI, because the environment may differ later.
@@ -129,8 +143,17 @@ class Multirun(Callback):
             launcher=ProcessInfo.current() if launcher in ON_THIS_MACHINE else None,
         )
         grid.write(folder)
-        Multirun.folder, Multirun.outbox = folder, begin_outbox(folder, run.info.run_id, tracking["uri"])
+        Multirun.folder, Multirun.grid = folder, grid
+        Multirun.outbox = begin_outbox(folder, run.info.run_id, tracking["uri"])
         Multirun.launcher = launcher
+
+
+def _check_not_continued(store: TrackingStore, experiment_id: str, run_id: str) -> None:
+    """Raise `ResumeError` if another grid continues a grid, and has taken over its jobs."""
+    later = store.get_run(run_id).data.tags.get(CONTINUED_TAG, "")
+    # A grid is deleted if none of its jobs has begun.
+    if later.isalnum() and store.runs([experiment_id], f"attributes.run_id IN ('{later}')"):
+        raise ResumeError(f"run {run_id} is continued by run {later}: resume that one, {RESUME}={later}")
 
 
 @contextmanager
@@ -152,7 +175,7 @@ def end_grid(*, is_interrupted: bool = False) -> int:
     Returns:
         The exit code: 0 if every job succeeded, or if this was not a grid; 1 otherwise.
     """
-    if Multirun.folder is None:
+    if Multirun.folder is None or (grid := Multirun.grid) is None:
         return 0
     folder, outcomes = Multirun.folder, _read_outcomes(Multirun.folder)
     failed = {number: outcome for number, outcome in outcomes.items() if outcome.failure is not None}
@@ -162,7 +185,6 @@ def end_grid(*, is_interrupted: bool = False) -> int:
     outcomes |= {number: replace(failed.pop(number), failure=INTERRUPTED) for number in interrupted}
     has_failed = bool(failed) or not outcomes
     status = "KILLED" if is_interrupted or (interrupted and not has_failed) else "FAILED" if has_failed else "FINISHED"
-    grid = Grid.read(folder)
     try:
         store, runs = _close_parent(folder, grid, status, outcomes)
     except TrackingError as error:
@@ -193,8 +215,7 @@ def end_grid(*, is_interrupted: bool = False) -> int:
 
 def print_resume_command() -> None:
     """Print the command that resumes a grid that could not be closed."""
-    if Multirun.folder is not None:
-        grid = Grid.read(Multirun.folder)
+    if (grid := Multirun.grid) is not None:
         again = resume_command(grid.run_id, grid.uri, trust=grid.resume_needs_trust)
         print(f"the grid was not closed; resume it with: {again}", file=sys.stderr)
 

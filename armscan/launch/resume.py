@@ -57,7 +57,7 @@ def resume(arguments: Sequence[str]) -> GridToRepeat | None:
         return None
     check_unfinished(run)
     _check_ended(run)
-    overrides = grid_overrides(run)
+    overrides = _overrides_of(run)
     if not trust:
         _check_trust(run, overrides, uri)
     enter_working_folder(run, trust=trust)
@@ -90,7 +90,7 @@ def _check_ended(run: Run) -> None:
         )
 
 
-def grid_overrides(run: Run) -> list[str]:
+def _overrides_of(run: Run) -> list[str]:
     """Return the overrides that repeat a grid."""
     try:
         return TypeAdapter(list[str]).validate_json(tag_of(run, GRID_TAG), strict=True)

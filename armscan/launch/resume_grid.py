@@ -17,17 +17,17 @@ from armscan.config.defaults import FOLD, to_plain
 from armscan.config.own_code import changed_modules
 from armscan.config.task import is_under
 from armscan.config.trust import check_composed
-from armscan.errors import ArmscanError, TrackingError
+from armscan.errors import TrackingError
 from armscan.experiment.build import check_keys, set_up
 from armscan.experiment.job import Invocation, Job
 from armscan.experiment.provenance import provenance_files, sha256_tags
 from armscan.experiment.results import LAST_VALIDATION, figures_of
 from armscan.experiment.resume import check_own_code, resume_run
 from armscan.experiment.runner import run_experiment
-from armscan.launch.resume import grid_overrides
 from armscan.tracking import TrackingStore, load_run, open_store, sync
+from armscan.tracking.git import code_tags
 from armscan.tracking.sanitize import params_of
-from armscan.tracking.tags import FOLDER_TAG, JOB_TAG, OWN_CODE_TAG, PARENT_TAG, STUDY_TAG
+from armscan.tracking.tags import CONTINUED_TAG, FOLDER_TAG, JOB_TAG, OWN_CODE_TAG, PARENT_TAG
 from armscan.training import Fingerprints, check_unchanged
 from armscan.utils.run_files import LAST_CHECKPOINT, folder_lock
 
@@ -45,56 +45,69 @@ def run_again(config: DictConfig, invocation: Invocation, job: Job) -> Metrics:
         check_composed(resolved, where=f"job {job.number}")
     setup = set_up(config)
     store, experiment_id = open_store(**resolved["tracking"])
-    earlier = earlier_runs(store, experiment_id, sha256_tags(provenance_files(resolved, setup)), job)
-    if not any(run.data.tags.get(PARENT_TAG) == job.grid.repeats for run in earlier):
+    earlier = earlier_runs(store, experiment_id, sha256_tags(provenance_files(resolved, setup)), job, setup.own_code)
+    if not any(PARENT_TAG in run.data.tags for run in earlier):
         _check_volumes(store, experiment_id, params_of(resolved), setup.fingerprints, job)
     for run in earlier:
-        if run.data.tags.get(PARENT_TAG) == job.grid.repeats:
+        if PARENT_TAG in run.data.tags:
             check_own_code(run, setup)
-    # Of other grids, and single runs.
-    earlier = [run for run in earlier if not changed_modules(run.data.tags.get(OWN_CODE_TAG), setup.own_code)]
-    for run in earlier:
+    # Those of the grid first, of these the finished ones.
+    for run in sorted(earlier, key=lambda run: (PARENT_TAG not in run.data.tags, run.info.status != "FINISHED")):
         if run.info.status == "FINISHED":
             print(f"[{job.label}] has finished before: run {run.info.run_id}", flush=True)
             _set_parent(store, run, job)
             return _metrics_of(run)
-    for run in earlier:
-        folder = run.data.tags.get(FOLDER_TAG)
-        is_of_grid = run.data.tags.get(PARENT_TAG) == job.grid.repeats
-        if is_of_grid and run.info.status == "RUNNING" and folder is not None and Path(folder).is_dir():
+        if FOLDER_TAG not in run.data.tags:
+            continue
+        folder = Path(run.data.tags[FOLDER_TAG])
+        if PARENT_TAG in run.data.tags and run.info.status == "RUNNING" and folder.is_dir():
             # Raises if the run is in progress, as after its launcher was killed: it would be trained twice.
-            with folder_lock(Path(folder)):
+            with folder_lock(folder):
                 # Ends the run if its process has died.
-                sync(Path(folder), lambda _: store)
+                sync(folder, lambda _: store)
             run = store.get_run(run.info.run_id)
-        if run.info.status != "RUNNING" and folder is not None and (Path(folder) / LAST_CHECKPOINT).exists():
+        if run.info.status != "RUNNING" and (folder / LAST_CHECKPOINT).exists():
             _set_parent(store, run, job)
             # Trusted, because its configuration is this job's.
             return resume_run(store, run.info.run_id, job_label=job.label, trust=True)
     return run_experiment(config, invocation)
 
 
-def earlier_runs(store: TrackingStore, experiment_id: str, sums: Mapping[str, str], job: Job) -> list[Run]:
+def earlier_runs(
+    store: TrackingStore, experiment_id: str, sums: Mapping[str, str], job: Job, own_code: Mapping[str, str]
+) -> list[Run]:
     """Return the earlier runs of a job: first those of the repeated grid, and each time the latest first.
 
-    Then come single runs, and jobs of grids with the same command line, such as an earlier repetition. Trials of
-    studies and jobs of other grids are left out.
+    The repeated grid may have continued others, whose jobs it had not come to. Then come single runs of the same code.
 
     Args:
         store: Store of the runs.
         experiment_id: ID of their MLflow experiment.
         sums: Checksums of the job's configuration and volumes, as tags.
         job: Job to repeat.
+        own_code: Checksums of the modules of the user's own classes, by their names.
     """
+    assert job.grid.repeats is not None
+    grids, code = _with_continued(store, experiment_id, job.grid.repeats), code_tags()
     wanted = " and ".join(f"tags.`{tag}` = '{value}'" for tag, value in sums.items())
-    found = store.search_runs([experiment_id], wanted, order_by=["attributes.start_time DESC"])
-    parents = {run.info.run_id: run.data.tags.get(PARENT_TAG) for run in found if STUDY_TAG not in run.data.tags}
-    known = [each for each in {*parents.values(), job.grid.run_id} if each is not None and each.isalnum()]
-    grids = store.runs([experiment_id], f"attributes.run_id IN ({', '.join(map(repr, known))})")
-    overrides = {grid.info.run_id: _overrides_of(grid) for grid in grids}
-    kin = {grid for grid in overrides if overrides[grid] == overrides.get(job.grid.run_id)} | {job.grid.repeats, None}
-    own = [run for run in found if run.info.run_id in parents and parents[run.info.run_id] in kin]
-    return sorted(own, key=lambda run: parents[run.info.run_id] != job.grid.repeats)
+    own, alone = [], []
+    for run in store.search_runs([experiment_id], wanted, order_by=["attributes.start_time DESC"]):
+        tags = run.data.tags
+        if tags.get(PARENT_TAG) in grids:
+            own.append(run)
+        elif PARENT_TAG not in tags and all(tags.get(name, "") == value for name, value in code.items()):
+            alone += [] if changed_modules(tags.get(OWN_CODE_TAG), own_code) else [run]
+    return own + alone
+
+
+def _with_continued(store: TrackingStore, experiment_id: str, grid: str) -> set[str]:
+    """Return the run IDs of a grid, and of those that it continues."""
+    found, new = set[str](), [grid]
+    while new:
+        found.add(each := new.pop())
+        before = store.search_runs([experiment_id], f"tags.`{CONTINUED_TAG}` = '{each}'")
+        new += [run.info.run_id for run in before if run.info.run_id not in found]
+    return found
 
 
 def _check_volumes(
@@ -121,13 +134,6 @@ def _data_in(params: Mapping[str, str]) -> dict[str, str]:
 
 def _joined(prints: Fingerprints) -> dict[str, str]:
     return {name: each for volumes in prints.values() for name, each in volumes.items()}
-
-
-def _overrides_of(grid: Run) -> set[str]:
-    """Return the overrides that repeat a grid, each once; empty for a run that is not a grid."""
-    with contextlib.suppress(ArmscanError):
-        return set(grid_overrides(grid))
-    return set()
 
 
 def _set_parent(store: TrackingStore, run: Run, job: Job) -> None:

@@ -132,6 +132,14 @@ def _on_code(groups: Sequence[Group]) -> Iterator[str]:
         if len(group.commits) > 1:
             commits = ", ".join(sorted(commit[:ID_CHARS] for commit in group.commits))
             yield f"Group {group.number}: its runs used different versions of armscan: {commits}."
+    of_groups = {
+        group.number: " and ".join(sorted(each[:ID_CHARS] for each in group.commits))
+        for group in groups
+        if group.commits
+    }
+    if len(set(of_groups.values())) > 1:
+        told = ", ".join(f"group {number} {commits}" for number, commits in of_groups.items())
+        yield f"The groups used different versions of armscan: {told}. Differences may be those of the code."
 
 
 def _on_volumes(groups: Sequence[Group]) -> Iterator[str]:

@@ -12,10 +12,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import armscan
-from armscan.tracking.tags import COMMIT_TAG, UNKNOWN
+from armscan.tracking.tags import COMMIT_TAG, UNKNOWN, VERSION_TAG
 from armscan.utils.files import sha256
 
 COMMIT, DIRTY, DIFF_SUM = "git.commit", "git.dirty", "git.diff.sha256"
+# What identifies the code of a run.
+CODE_TAGS = (VERSION_TAG, COMMIT, DIFF_SUM)
 # Largest untracked file that the diff includes: source code, but no volume beside it.
 MAX_UNTRACKED_BYTES = 2**20
 # Override the user's settings of `git diff`, which could break `git apply`.
@@ -58,6 +60,12 @@ def code_version() -> str:
     sources = (f"{file.relative_to(package)}\0".encode() + file.read_bytes() for file in sorted(package.rglob("*.py")))
     version = armscan.__version__ if commit == UNKNOWN else commit[:COMMIT_CHARS]
     return f"{version} {sha256(b''.join(sources))[:SOURCE_CHARS]}"
+
+
+def code_tags() -> dict[str, str]:
+    """Return the tags by which a run's code is compared with today's: armscan's version, commit and changes."""
+    tags = code_state().tags
+    return {VERSION_TAG: armscan.__version__, COMMIT: tags[COMMIT], DIFF_SUM: tags.get(DIFF_SUM, "")}
 
 
 def code_state_in(folder: Path) -> CodeState:

@@ -1,5 +1,6 @@
 """Multiruns: the overrides that their jobs share, the address of their store, and their end."""
 
+import contextlib
 import json
 import sys
 from dataclasses import asdict
@@ -14,12 +15,14 @@ from omegaconf import OmegaConf
 
 from armscan import run
 from armscan.config.error_messages import one_line_message
-from armscan.errors import ArmscanError
-from armscan.experiment.job import INTERRUPTED, OUTCOME_FOLDER, Grid, JobOutcome
+from armscan.errors import ArmscanError, InvalidValueError, ResumeError
+from armscan.experiment.job import GRID_FILE, INTERRUPTED, OUTCOME_FOLDER, Grid, JobOutcome
+from armscan.launch import multirun
 from armscan.launch.grid_jobs import shared_overrides
 from armscan.launch.multirun import Multirun, end_grid
 from armscan.tracking import begin_outbox, sync
-from armscan.tracking.tags import BEST_TAG, FOLDER_TAG, JOB_TAG, OWN_CODE_TAG, PARENT_TAG
+from armscan.tracking.git import COMMIT
+from armscan.tracking.tags import BEST_TAG, CONTINUED_TAG, FOLDER_TAG, JOB_TAG, OWN_CODE_TAG, PARENT_TAG
 from armscan.utils.processes import ProcessInfo
 from tests.support.stores import store_in
 
@@ -31,8 +34,8 @@ def test_address_of_the_store_is_read_again_as_it_was(uri):
 
 
 def test_second_interrupt_leaves_the_command_that_resumes_the_grid(tmp_path, monkeypatch, capsys):
-    Grid(run_id="a" * 32, tracking={"uri": "sqlite:///mine.db"}, overrides=[], shared=[]).write(tmp_path)
-    monkeypatch.setattr(Multirun, "folder", tmp_path)
+    grid = Grid(run_id="a" * 32, tracking={"uri": "sqlite:///mine.db"}, overrides=[], shared=[])
+    monkeypatch.setattr(Multirun, "grid", grid)
     monkeypatch.setattr(run, "end_grid", Mock(side_effect=KeyboardInterrupt))
     run._end_interrupted()
     told = capsys.readouterr().err
@@ -60,14 +63,14 @@ def test_job_that_was_stopped_alone_has_not_failed(tmp_path, database, monkeypat
     store, experiment_id = store_in(tmp_path, "a")
     parent = store.create_run(experiment_id, name="multirun", tags={}).info.run_id
     tracking = {"uri": store.uri, "experiment": "a", "artifacts": str(tmp_path / "artifacts"), "wait_s": 60.0}
-    Grid(run_id=parent, tracking=tracking, overrides=["seed=0,1"], shared=[]).write(tmp_path)
+    grid = Grid(run_id=parent, tracking=tracking, overrides=["seed=0,1"], shared=[])
     (tmp_path / OUTCOME_FOLDER).mkdir()
     jobs = []
     for number, failure in enumerate((INTERRUPTED, None, None)):
         outcome = JobOutcome(f"seed={number}", f"seed={number}", failure)
         (tmp_path / OUTCOME_FOLDER / f"{number}.json").write_text(json.dumps(asdict(outcome)))
         tags = {JOB_TAG: str(number), FOLDER_TAG: str(tmp_path / str(number)), PARENT_TAG: parent}
-        tags |= {OWN_CODE_TAG: f"mine:01 parts:{number}"}
+        tags |= {OWN_CODE_TAG: f"mine:01 parts:{number}", COMMIT: f"{number:040}"}
         jobs.append(store.create_run(experiment_id, name="job", tags=tags).info.run_id)
         if failure is None:
             store.set_terminated(jobs[-1], "FINISHED")
@@ -75,13 +78,34 @@ def test_job_that_was_stopped_alone_has_not_failed(tmp_path, database, monkeypat
     for job, rate in zip(jobs, (0.9, 0.4, 0.3), strict=True):
         store.log_batch(job, metrics=[Metric("test_volumes/on_plane_5mm_10deg", rate, 1, 0)])
     monkeypatch.setattr(Multirun, "folder", tmp_path)
+    monkeypatch.setattr(Multirun, "grid", grid)
     assert end_grid() == 1
     assert [store.get_run(run_id).info.status for run_id in jobs] == ["KILLED", "FINISHED", "FINISHED"]
     assert store.get_run(parent).info.status == "KILLED"
     printed = capsys.readouterr()
     assert "failed" not in printed.err
     assert "note: the jobs used different versions of parts (tag own_code)" in printed.out
+    assert "note: the jobs used different versions of armscan's code (tags armscan.version, git.commit" in printed.out
     assert store.get_run(parent).data.tags[BEST_TAG] == jobs[1]
+
+
+@pytest.mark.parametrize("is_there", [True, False])
+def test_grid_that_another_one_continues_is_not_resumed_a_second_time(tmp_path, database, is_there):
+    store, experiment_id = store_in(tmp_path, "a")
+    later = store.create_run(experiment_id, name="later", tags={}).info.run_id
+    grid = store.create_run(experiment_id, name="grid", tags={CONTINUED_TAG: later}).info.run_id
+    if not is_there:
+        store.delete_run(later)
+    expected = pytest.raises(ResumeError, match=f"is continued by run {later}: resume that one, resume={later}")
+    with expected if is_there else contextlib.nullcontext():
+        multirun._check_not_continued(store, experiment_id, grid)
+    multirun._check_not_continued(store, experiment_id, later if is_there else grid)
+
+
+def test_damaged_file_of_a_grid_is_one_line(tmp_path):
+    (tmp_path / GRID_FILE).write_text("{")
+    with pytest.raises(InvalidValueError, match=f"{tmp_path}/{GRID_FILE}: is damaged"):
+        Grid.read(tmp_path)
 
 
 def test_run_of_a_grid_whose_launcher_has_died_is_closed(tmp_path, database, monkeypatch):

@@ -1,6 +1,5 @@
 """The earlier runs of a repeated grid's jobs."""
 
-import contextlib
 import json
 
 import pytest
@@ -12,7 +11,8 @@ from armscan.experiment.build import build_setup
 from armscan.experiment.job import Grid, Invocation, Job
 from armscan.launch.resume_grid import earlier_runs, run_again
 from armscan.tracking import TrackedRun
-from armscan.tracking.tags import GRID_TAG, OWN_CODE_TAG, PARENT_TAG, STUDY_TAG
+from armscan.tracking.git import COMMIT, code_tags
+from armscan.tracking.tags import CONTINUED_TAG, GRID_TAG, OWN_CODE_TAG, PARENT_TAG, STUDY_TAG
 from armscan.utils.files import sha256
 from armscan.utils.run_files import SHA256_TAGS, VOLUMES_FILE
 from tests.support.stores import store_in
@@ -27,31 +27,31 @@ def job_of(number, grid, *, repeats, folder):
     return Job(number, "", "", folder, grid)
 
 
-def test_earlier_run_is_of_the_repeated_grid_and_never_of_a_study_or_another_grid(tmp_path, database):
+def test_earlier_run_is_of_the_repeated_grid_or_one_that_it_continued_or_a_single_run_of_the_same_code(
+    tmp_path, database
+):
     client, experiment_id = store_in(tmp_path, "armscan")
 
     def run_with(**tags):
         return client.create_run(experiment_id, name="any", tags=tags).info.run_id
 
-    def grid(*words):
-        return run_with(**{GRID_TAG: json.dumps(words)})
+    def run_of(grid, **tags):
+        return run_with(**SUMS, **{PARENT_TAG: grid}, **tags)
 
-    uri = "tracking.uri='x'"
-    repeated, before, now = (
-        grid("seed=0,1", "a=1", uri),
-        grid("seed=0,1", uri, "a=1", uri),
-        grid("seed=0,1", uri, "a=1"),
-    )
-    ours = run_with(**SUMS, **{PARENT_TAG: repeated})
-    alone = run_with(**SUMS)
-    of_repetition = run_with(**SUMS, **{PARENT_TAG: before})
-    run_with(**SUMS, **{PARENT_TAG: grid("seed=1,2", uri)})
-    run_with(**SUMS, **{PARENT_TAG: run_with(**{STUDY_TAG: "s"}), STUDY_TAG: "s"})
+    repeated, other = (run_with(**{GRID_TAG: json.dumps(["seed=0,1"])}) for _ in range(2))
+    middle = run_with(**{CONTINUED_TAG: repeated})
+    first = run_with(**{CONTINUED_TAG: middle})
+    ours, of_first = run_of(repeated), run_of(first)
+    alone = run_with(**SUMS, **code_tags())
+    # Of another grid with the same command line, of a study, with other volumes, and of other code.
+    run_of(other, **code_tags())
+    run_of(run_with(**{STUDY_TAG: "s"}), **{STUDY_TAG: "s"}, **code_tags())
     run_with(**SUMS | {"volumes.sha256": "c"}, **{PARENT_TAG: repeated})
-    job = job_of(0, now, repeats=repeated, folder=tmp_path)
-    found = [run.info.run_id for run in earlier_runs(client, experiment_id, SUMS, job)]
-    assert found[0] == ours
-    assert {*found} == {ours, alone, of_repetition}
+    run_with(**SUMS, **code_tags() | {COMMIT: "0" * 40})
+    run_with(**SUMS, **code_tags(), **{OWN_CODE_TAG: "parts:01"})
+    job = job_of(0, "2" * 32, repeats=repeated, folder=tmp_path)
+    found = [run.info.run_id for run in earlier_runs(client, experiment_id, SUMS, job, {"parts": "02"})]
+    assert found == [of_first, ours, alone]
 
 
 @pytest.mark.parametrize("change", ["new", "changed", "lost", None])
@@ -87,20 +87,15 @@ def test_grid_goes_on_with_the_same_volumes_alone(tmp_path, database, change):
     assert bool(begun) == (change in ("lost", None))
 
 
-@pytest.mark.parametrize("is_of_grid", [True, False])
-def test_only_runs_of_the_grid_must_have_the_same_own_code(tmp_path, database, monkeypatch, is_of_grid):
+def test_runs_of_the_grid_must_have_the_same_own_code(tmp_path, database, monkeypatch):
     config = compose([*FEW, f"tracking.uri=sqlite:///{tmp_path}/mlruns.db"])
     client, experiment_id = store_in(tmp_path, config.tracking.experiment)
-    tags = {OWN_CODE_TAG: "parts:01", PARENT_TAG: ("1" if is_of_grid else "3") * 32}
-    other = client.create_run(experiment_id, name="n", tags=tags)
+    other = client.create_run(experiment_id, name="n", tags={OWN_CODE_TAG: "parts:01", PARENT_TAG: "1" * 32})
     client.set_terminated(other.info.run_id)
-    job, begun = job_of(0, "2" * 32, repeats="1" * 32, folder=tmp_path), []
+    job = job_of(0, "2" * 32, repeats="1" * 32, folder=tmp_path)
     monkeypatch.setattr("armscan.launch.resume_grid.earlier_runs", lambda *_: [client.get_run(other.info.run_id)])
-    monkeypatch.setattr("armscan.launch.resume_grid.run_experiment", lambda *_: begun.append(1))
-    expected = pytest.raises(ResumeError, match="other code of parts") if is_of_grid else contextlib.nullcontext()
-    with expected:
+    with pytest.raises(ResumeError, match="other code of parts"):
         run_again(config, Invocation(tmp_path, [], "", {}, job), job)
-    assert bool(begun) is not is_of_grid
 
 
 def test_job_of_a_stored_command_line_builds_no_class_of_others(tmp_path):

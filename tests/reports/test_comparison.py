@@ -241,6 +241,13 @@ def test_runs_of_a_group_that_ran_other_code_are_told(written, make_training, ke
     assert "used different versions" not in page
 
 
+def test_groups_that_ran_other_code_are_told(written, make_training):
+    page, _ = written(
+        make_training(0, commit="0123456789"), make_training(0, commit="abcdef0123", params={"agent.lr": "1"})
+    )
+    assert "The groups used different versions of armscan: group 1 01234567, group 2 abcdef01." in page
+
+
 def test_pairs_that_chance_alone_sets_in_bold_are_counted(written, make_training):
     # Four groups of three seeds and one of two, which none of the others can be told apart from.
     page, _ = written(

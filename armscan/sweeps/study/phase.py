@@ -54,7 +54,7 @@ class Phase:
     objectives: tuple[str, ...]
     reported: tuple[str, ...]
     run: Callable[[Attempt], dict[str, float]]
-    seeds_of: Callable[[Trial], tuple[int, ...]]
+    seeds_of: Callable[[FrozenTrial | Trial], tuple[int, ...]]
     sampler: Mapping[str, Any]
     seed: int
     folder: Path
@@ -64,7 +64,7 @@ class Phase:
     run_id: str
     population: Population | None = None
 
-    def remove_checkpoints(self, finished: Trial) -> None:
+    def remove_checkpoints(self, finished: FrozenTrial | Trial) -> None:
         """Remove the last checkpoints of a finished trial and of its earlier attempts; the best ones stay.
 
         In a population, remove the last checkpoints of all trials from which no member can continue any more.

@@ -27,6 +27,7 @@ from armscan.sweeps.study.phase import OpenedStudy
 from armscan.sweeps.workers.heartbeat import LivenessCheck
 from armscan.sweeps.workers.monitor import StudyMonitor
 from armscan.sweeps.workers.supervisor import LAUNCHER_FILE, STOP_FILE, WORKER_FILES, keep_gpus, local_workers
+from armscan.sweeps.workers.trial_run import end_runs_left_open
 from armscan.tracking import TrackedRun, sync
 from armscan.tracking.run import SHORT_WAIT_S
 from armscan.tracking.store import store_errors
@@ -63,6 +64,8 @@ def run_workers(opened: OpenedStudy, given: StudyCommand, launcher: str, launch:
         if _has_finished(opened):
             # Trusted: see `_upload`.
             sync(opened.folder, lambda _: search.store, trust=True)
+            for phase in opened.phases:
+                end_runs_left_open(phase)
             return
     started = f"{datetime.now():%Y-%m-%d_%H-%M-%S}_{socket.gethostname()}_{os.getpid()}"
     folder = working_folder() / opened.folder / "workers" / started
@@ -233,6 +236,7 @@ def _upload(opened: OpenedStudy, monitor: StudyMonitor, tracked: TrackedRun, sta
         store = opened.search.store
         with contextlib.suppress(ArmscanError), no_retry(), store_errors(store.uri):
             for phase in opened.phases:
+                end_runs_left_open(phase)
                 phase.close_orphaned_runs()
             if monitor.is_worked_on():
                 store.update_run(opened.search.run_id, status="RUNNING")

@@ -1,4 +1,4 @@
-"""The tracked run of a trial: a worker opens it when the trial begins, and closes it when the trial is requeued."""
+"""The tracked run of a trial: a worker opens it when the trial begins, and ends it with the trial."""
 
 from __future__ import annotations
 
@@ -6,16 +6,26 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
-from optuna.trial import Trial
+from optuna.trial import FrozenTrial, Trial, TrialState
 
 from armscan.sweeps.scheduling.claim import PendingWrites
 from armscan.sweeps.space.parameter import overrides_of
-from armscan.sweeps.storage.attribute_names import RETRY_OF, RUN
-from armscan.sweeps.study.dashboard import note_run
+from armscan.sweeps.storage.attribute_names import METRICS, RETRY_OF, RUN
+from armscan.sweeps.storage.attributes import SELECTION_SUFFIX
+from armscan.sweeps.study.dashboard import named_as_of_runs, note_run
 from armscan.sweeps.study.phase import Phase
 from armscan.sweeps.tasks.attempt import trial_folder
 from armscan.tracking import TrackedRun, run_of_study
-from armscan.tracking.tags import FOLDER_TAG, OVERRIDES_TAG, PARENT_TAG, STUDY_TAG, TRIAL_TAG
+from armscan.tracking.sync import PROCESS_DIED
+from armscan.tracking.tags import (
+    FAILURE_TAG,
+    FOLDER_TAG,
+    OVERRIDES_TAG,
+    PARENT_TAG,
+    SELECTION_PREFIX,
+    STUDY_TAG,
+    TRIAL_TAG,
+)
 from armscan.utils.run_files import CONFIG_FILE, SHA256_TAGS
 
 
@@ -65,6 +75,45 @@ def open_run(
     writes.append(partial(note_run, trial, phase.store, phase.experiment_id, tracked.run_id, folder))
     writes.append(partial(trial.set_user_attr, RUN, tracked.run_id))
     return tracked
+
+
+def end_run(
+    phase: Phase,
+    tracked: TrackedRun,
+    trial: Trial | FrozenTrial,
+    state: TrialState,
+    metrics: Mapping[str, float],
+    reason: str | None = None,
+) -> None:
+    """Track the outcome of a trial, and end its run.
+
+    Args:
+        phase: Phase of the trial.
+        tracked: Run of the trial.
+        trial: The trial.
+        state: Its final state.
+        metrics: Its metrics; empty if it was pruned or has failed.
+        reason: Why it has failed. Default: None, it has not.
+    """
+    prefix = SELECTION_PREFIX if phase.name.endswith(SELECTION_SUFFIX) else "validation/"
+    named = named_as_of_runs(metrics, len(phase.seeds_of(trial)), prefix)
+    tracked.log_metrics({**metrics, **named}, n_env_steps=0)
+    if state == TrialState.PRUNED:
+        tracked.set_pruned()
+    tracked.end("FAILED" if reason else "FINISHED", reason=reason)
+
+
+def end_runs_left_open(phase: Phase) -> None:
+    """Track the outcomes of finished trials whose workers died after the storage had them, and end their runs."""
+    finished = {trial.user_attrs.get(RUN): trial for trial in phase.scheduler.state().finished}
+    died = f"tags.{STUDY_TAG} = '{phase.name}' AND tags.{FAILURE_TAG} = '{PROCESS_DIED}'"
+    for run in phase.store.runs([phase.experiment_id], died):
+        if (trial := finished.get(run.info.run_id)) is not None:
+            folder = trial_folder(phase.folder, trial.number)
+            tracked = TrackedRun.open_existing(phase.store, run.info.run_id, name=run.info.run_name, folder=folder)
+            tracked.resume()
+            end_run(phase, tracked, trial, trial.state, trial.user_attrs.get(METRICS, {}))
+            phase.remove_checkpoints(trial)
 
 
 def close_requeued(*runs: TrackedRun | None) -> None:

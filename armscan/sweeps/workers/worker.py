@@ -23,16 +23,14 @@ from armscan.sweeps.scheduling.limits import LimitReachedError
 from armscan.sweeps.scheduling.scheduler import TrialScheduler
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.attribute_names import CONFIG_SHA256, ENV_STEPS, FAILURE, FOLDER, METRICS, RUN
-from armscan.sweeps.storage.attributes import SELECTION_SUFFIX
 from armscan.sweeps.study.components import make, read_settings
-from armscan.sweeps.study.dashboard import named_as_of_runs, note_run, show_picture, shown_metrics, table_of_seeds
+from armscan.sweeps.study.dashboard import note_run, show_picture, shown_metrics, table_of_seeds
 from armscan.sweeps.study.open import open_for_work
 from armscan.sweeps.study.phase import Phase
 from armscan.sweeps.tasks.attempt import TAKEN_OVER, Attempt, check_metrics, config_sha256, trial_folder
 from armscan.sweeps.workers.heartbeat import Heartbeat
-from armscan.sweeps.workers.trial_run import close_requeued, open_run
+from armscan.sweeps.workers.trial_run import close_requeued, end_run, open_run
 from armscan.tracking import TrackedRun
-from armscan.tracking.tags import SELECTION_PREFIX
 from armscan.utils.log import log, silence_libraries
 
 WAIT_S = 1.0
@@ -194,14 +192,8 @@ class Worker:
         if not reason:
             # Not earlier: until the storage has its outcome, the trial may have to be resumed.
             self._phase.remove_checkpoints(trial)
-        if tracked is None:
-            return
-        prefix = SELECTION_PREFIX if self._phase.name.endswith(SELECTION_SUFFIX) else "validation/"
-        named = named_as_of_runs(metrics, len(self._phase.seeds_of(trial)), prefix)
-        tracked.log_metrics(metrics | named, n_env_steps=0)
-        if state == TrialState.PRUNED:
-            tracked.set_pruned()
-        tracked.end("FAILED" if reason else "FINISHED", reason=reason)
+        if tracked is not None:
+            end_run(self._phase, tracked, trial, state, metrics, reason)
 
     def _let_go(self, trial: Trial, tracked: TrackedRun | None) -> None:
         log(f"trial {trial.number} was taken over by another worker")
