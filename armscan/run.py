@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 
 from armscan.utils.processes import (
+    EXIT_INTERRUPTED,
     collect_garbage_rarely,
     discard_output,
     end_like_ctrl_c,
@@ -165,7 +166,7 @@ def main() -> int:
     # Not in the handler, where every further error would seem to follow from the interruption.
     _end_interrupted()
     print(INTERRUPTED, file=sys.stderr)
-    return 130
+    return EXIT_INTERRUPTED
 
 
 if __name__ == "__main__":

@@ -16,10 +16,9 @@ from armscan.cli.runs import runs
 from armscan.cli.ui import ui
 from armscan.errors import in_one_line, is_interruption, print_error
 from armscan.utils.log import silence_libraries
-from armscan.utils.processes import collect_garbage_rarely, discard_output
+from armscan.utils.processes import EXIT_INTERRUPTED, collect_garbage_rarely, discard_output
 
 PROGRAM = "armscan"
-INTERRUPTED = 130
 
 
 class PassedOn(click.Command):
@@ -83,7 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Exception as error:
         if is_interruption(error):
             print("interrupted", file=sys.stderr)
-            return INTERRUPTED
+            return EXIT_INTERRUPTED
         # Deferred: it loads Hydra.
         from armscan.config.error_messages import print_mistake
 

@@ -22,7 +22,7 @@ from armscan.experiment.build import RunSetup, set_up
 from armscan.experiment.provenance import place_tags, volume_tags
 from armscan.experiment.runner import run_tracked
 from armscan.tracking import TrackedRun, TrackingStore, check_version, sync
-from armscan.tracking.tags import FOLDER_TAG, HOST_TAG, OWN_CODE_TAG, STUDY_TAG, WORKING_FOLDER_TAG
+from armscan.tracking.tags import FOLDER_TAG, HOST_TAG, OWN_CODE_TAG, STUDY_TAG, VALIDATION_PREFIX, WORKING_FOLDER_TAG
 from armscan.training import Fingerprints, check_unchanged, fingerprints_in, resume_from_checkpoint
 from armscan.utils.files import NAMED_PIPE, remove_unfinished, sha256
 from armscan.utils.run_files import (
@@ -132,7 +132,7 @@ def _started_with(run: Run, file: Path, what: str) -> bytes:
 def _check_last_checkpoint(run: Run, folder: Path) -> None:
     """Raise `ResumeError` if a training would restart although its epochs have been tracked."""
     last = folder / LAST_CHECKPOINT
-    if not last.exists() and any(name.startswith("validation/") for name in run.data.metrics):
+    if not last.exists() and any(name.startswith(VALIDATION_PREFIX) for name in run.data.metrics):
         raise ResumeError(
             f"{last}: this checkpoint is gone, but run {run.info.run_id} has tracked epochs, which would "
             "be trained and tracked again: put it back, or start another run"

@@ -15,7 +15,7 @@ from omegaconf import DictConfig
 
 from armscan.config.error_messages import one_line_message
 from armscan.experiment.job import INTERRUPTED, NO_OUTCOME, Invocation, Job, remove_if_untracked
-from armscan.utils.processes import ProcessInfo, child_command, interruptions, on_exit, on_parent_exit
+from armscan.utils.processes import EXIT_INTERRUPTED, ProcessInfo, child_command, interruptions, on_exit, on_parent_exit
 
 
 def start_job(config: DictConfig, invocation: Invocation, job: Job) -> None:
@@ -59,7 +59,7 @@ def run_job(launcher_pid: int) -> None:
     def leave(*_: object) -> None:
         """End the job at once, without an exception, which compiled code can turn into any other error."""
         job.write_outcome(failure=INTERRUPTED)
-        os._exit(130)
+        os._exit(EXIT_INTERRUPTED)
 
     def end(**outcome: Any) -> None:
         """Write the outcome, and ignore later interrupts."""

@@ -19,7 +19,15 @@ from armscan.tracking import TrackingStore
 from armscan.tracking.histories import History, metric_histories
 from armscan.tracking.run import PRUNED
 from armscan.tracking.store import store_errors
-from armscan.tracking.tags import CHOICE, COMMIT_TAG, OVERRIDES_TAG, OWN_CODE_TAG, PRUNED_TAG, VERSION_TAG
+from armscan.tracking.tags import (
+    CHOICE,
+    COMMIT_TAG,
+    OVERRIDES_TAG,
+    OWN_CODE_TAG,
+    PRUNED_TAG,
+    VALIDATION_PREFIX,
+    VERSION_TAG,
+)
 from armscan.training import TEST, Evaluation
 from armscan.training.fingerprints import Fingerprints, fingerprints_in
 from armscan.training.metric_display import title_of
@@ -34,8 +42,7 @@ from armscan.utils.run_files import (
 )
 
 WALL = "wall_s"
-OF_VALIDATION = "validation/"
-VALIDATION = {f"{OF_VALIDATION}{name}": title_of(name) for name in ("success_rate", "mean_steps", "mean_return")}
+VALIDATION = {f"{VALIDATION_PREFIX}{name}": title_of(name) for name in ("success_rate", "mean_steps", "mean_return")}
 # Prefixes of the other metrics that are drawn.
 OF_THE_TRAINING = ("update/", "train/return", "train/length", "speed/")
 # MLflow's value of a parameter that is not set.
@@ -146,8 +153,10 @@ class TrackedTraining:
 def validation_titles(names: Iterable[str]) -> dict[str, str]:
     """Return the titles of those metrics that are of the validation, the on-plane rates first."""
     known = set(names)
-    rates = limits_among(name.removeprefix(OF_VALIDATION) for name in sorted(known) if name.startswith(OF_VALIDATION))
-    titles = {f"{OF_VALIDATION}{limits.metric}": limits.title for limits in rates}
+    rates = limits_among(
+        name.removeprefix(VALIDATION_PREFIX) for name in sorted(known) if name.startswith(VALIDATION_PREFIX)
+    )
+    titles = {f"{VALIDATION_PREFIX}{limits.metric}": limits.title for limits in rates}
     return titles | {name: title for name, title in VALIDATION.items() if name in known}
 
 
@@ -163,7 +172,7 @@ def read_trainings(store: TrackingStore, runs: Sequence[Run], folder: Path) -> l
         TrackingError: If one of their files is damaged, or the store cannot be used.
     """
     with store_errors(store.uri):
-        leading = {f"{OF_VALIDATION}{leading_of(migrate(run.data.params)).metric}" for run in runs}
+        leading = {f"{VALIDATION_PREFIX}{leading_of(migrate(run.data.params)).metric}" for run in runs}
         shown = {WALL, *VALIDATION, *leading}
         histories = metric_histories(store, {run.info.run_id: _wanted(run, shown) for run in runs})
         # Not by run ID, which may be a path in an untrusted store.

@@ -24,7 +24,7 @@ from armscan.sweeps.study.warm_start import initial_trials
 from armscan.sweeps.tasks.attempt import volume_sums, volumes_of
 from armscan.sweeps.workers.launch import run_workers
 from armscan.utils.console import print_sentence
-from armscan.utils.processes import n_usable_cores
+from armscan.utils.processes import EXIT_INTERRUPTED, n_usable_cores
 from armscan.utils.text import counted
 
 
@@ -81,5 +81,5 @@ def run_study(arguments: Sequence[str], launch: Callable[[Sequence[str]], object
         run_workers(opened, given, launcher, launch)
     except KeyboardInterrupt:
         print("interrupted; the same command resumes the study", file=sys.stderr)
-        return 130
+        return EXIT_INTERRUPTED
     return print_result(opened)

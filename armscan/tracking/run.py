@@ -17,7 +17,7 @@ from armscan.tracking.outbox import Address, Outbox, file_of, now_ms
 from armscan.tracking.pending_runs import forget
 from armscan.tracking.sanitize import params_of, tags_of
 from armscan.tracking.system_metrics import PREFIX, SystemMetrics
-from armscan.tracking.tags import FAILURE_TAG, PARENT_TAG, PRUNED_TAG, RESUMED_TAG
+from armscan.tracking.tags import FAILURE_TAG, PARENT_TAG, PRUNED_TAG, RESUMED_TAG, VALIDATION_PREFIX
 from armscan.tracking.tracking_store import TrackingStore
 from armscan.tracking.uploader import Uploader
 from armscan.utils.files import atomic_write
@@ -181,7 +181,7 @@ class TrackedRun:
 
     def on_epoch(self, report: EpochReport) -> None:
         """Log an epoch's metrics at its environment step."""
-        metrics = {f"validation/{name}": value for name, value in report.evaluation.metrics().items()}
+        metrics = {f"{VALIDATION_PREFIX}{name}": value for name, value in report.evaluation.metrics().items()}
         metrics |= report.metrics | {"wall_s": report.wall_s}
         self.log_metrics(metrics, n_env_steps=report.n_env_steps)
 

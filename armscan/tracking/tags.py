@@ -34,5 +34,5 @@ BEST_TAG = "best.run"
 CONTINUED_TAG = "continued_by"
 # Of a study's runs: its name and storage, the number of the trial, and whether the trial was pruned.
 STUDY_TAG, STORAGE_TAG, TRIAL_TAG, PRUNED_TAG = "study", "study.storage", "trial", "pruned"
-# Prefix of metrics that a study measures to select a configuration; no other run has them.
-SELECTION_PREFIX = "selection/"
+# Prefixes of metrics: of validations, and of what a study measures to select a configuration.
+VALIDATION_PREFIX, SELECTION_PREFIX = "validation/", "selection/"

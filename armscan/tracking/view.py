@@ -8,15 +8,16 @@ from __future__ import annotations
 import json
 
 from armscan.stats.on_plane import ON_PLANE
+from armscan.tracking.tags import VALIDATION_PREFIX
 
 VIEW_KEY = "armscan"
 VIEW_TAG = f"mlflow.sharedViewState.{VIEW_KEY}"
 LEADING = ON_PLANE[0].metric
 FIGURES = (LEADING, "median_distance_mm", "median_distance_deg", "success_rate", "mean_steps")
 CURVES = {
-    f"validation/{LEADING}": ON_PLANE[0].title,
-    "validation/success_rate": "success, by reward",
-    "validation/mean_steps": "steps, mean",
+    f"{VALIDATION_PREFIX}{LEADING}": ON_PLANE[0].title,
+    f"{VALIDATION_PREFIX}success_rate": "success, by reward",
+    f"{VALIDATION_PREFIX}mean_steps": "steps, mean",
 }
 SECTION = "learning-curves"
 # Width of a letter in a column heading, and of the space around the heading.
@@ -49,7 +50,7 @@ def _line(metric: str, title: str) -> dict[str, object]:
 def _columns() -> dict[str, int]:
     """Return the columns in their order, each with its width in pixels."""
     leading, *others = (f"test_volumes/{name}" for name in FIGURES)
-    metrics = [leading, f"random/{LEADING}", *others, f"validation/{LEADING}"]
+    metrics = [leading, f"random/{LEADING}", *others, f"{VALIDATION_PREFIX}{LEADING}"]
     return {
         **{f"metrics.`{name}`": LETTER_PX * len(name) + AROUND_PX for name in metrics},
         "params.`seed`": 80,

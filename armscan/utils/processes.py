@@ -22,6 +22,8 @@ import psutil
 from armscan.utils.files import atomic_write
 
 POLL_S = 0.5
+# Exit code of a process that Ctrl-C has ended.
+EXIT_INTERRUPTED = 130
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
@@ -96,7 +98,7 @@ def child_command(module: str, function: str) -> list[str]:
         f"{function}({os.getpid()})",
     )
     program = "\n    ".join(("try:", *steps))
-    return [sys.executable, "-c", f"{program}\nexcept KeyboardInterrupt:\n    raise SystemExit(130)"]
+    return [sys.executable, "-c", f"{program}\nexcept KeyboardInterrupt:\n    raise SystemExit({EXIT_INTERRUPTED})"]
 
 
 def process_start(pid: int) -> str:

@@ -26,7 +26,7 @@ from armscan.sweeps.study.candidates import NOTHING_SEARCHED
 from armscan.sweeps.study.final_eval import FinalEvaluation
 from armscan.sweeps.study.phase import OpenedStudy
 from armscan.sweeps.study.study import best_trials
-from armscan.sweeps.tasks.attempt import trial_folder
+from armscan.sweeps.tasks.attempt import seed_folder, trial_folder
 from armscan.training.metric_display import title_of, value_text
 from armscan.utils.console import WHOLE_CHARS, print_sentence, wide_console
 from armscan.utils.run_files import RUN_FILE
@@ -87,7 +87,7 @@ def _print_replay(opened: OpenedStudy) -> None:
     search = opened.search
     if search.population is not None and (best := best_trials(search.scheduler.study, 1)):
         for seed in opened.settings.seeds:
-            file = trial_folder(search.folder, best[0].number) / f"seed_{seed}" / RUN_FILE
+            file = seed_folder(trial_folder(search.folder, best[0].number), seed) / RUN_FILE
             # Its folder may have been pruned since.
             if not file.exists():
                 continue

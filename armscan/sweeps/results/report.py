@@ -35,8 +35,9 @@ from armscan.sweeps.storage.attribute_names import (
 from armscan.sweeps.study.candidates import name_of, settings_of
 from armscan.sweeps.study.final_eval import FinalEvaluation
 from armscan.sweeps.study.study import best_trials
+from armscan.sweeps.tasks.attempt import seed_folders
 from armscan.training.metric_display import title_of, value_text
-from armscan.utils.run_files import ID_CHARS
+from armscan.utils.run_files import ID_CHARS, VIDEO_FILE
 from armscan.utils.text import MISSING, counted
 
 # Names of trial states for users.
@@ -178,7 +179,7 @@ def _videos(final_trials: Sequence[FrozenTrial]) -> str:
     """Return one video of each configuration on the test volumes, from its first training with a video here."""
     videos: dict[int, str] = {}
     for trial in final_trials:
-        files = sorted(Path(trial.user_attrs.get(FOLDER, "nowhere")).glob("seed_*/episode.gif"))
+        files = [each / VIDEO_FILE for each in seed_folders(Path(trial.user_attrs.get(FOLDER, "nowhere")))]
         # An untrusted folder may have links to any file of this user.
         files = [file for file in files if file.is_file() and file.read_bytes().startswith(GIF)]
         number = trial.user_attrs[FINALIST]

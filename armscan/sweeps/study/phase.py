@@ -18,7 +18,7 @@ from armscan.sweeps.space.space import Space
 from armscan.sweeps.storage.attribute_names import FINALIST, RETRY_OF, RUN, SCHEDULE
 from armscan.sweeps.study.final_eval import FinalEvaluation
 from armscan.sweeps.study.settings import StudySettings
-from armscan.sweeps.tasks.attempt import Attempt, trial_folder
+from armscan.sweeps.tasks.attempt import Attempt, seed_folders, trial_folder
 from armscan.tracking import TrackingStore, fail_dead_runs
 from armscan.tracking.tags import FAILURE_TAG, STORAGE_TAG, STUDY_TAG, TRIAL_TAG
 from armscan.utils.run_files import LAST_CHECKPOINT
@@ -76,8 +76,8 @@ class Phase:
         if self.population is not None:
             numbers = {trial.number for trial in trials} - self.population.checkpoints_to_keep(trials)
         for number in numbers:
-            for file in trial_folder(self.folder, number).glob(f"seed_*/{LAST_CHECKPOINT}"):
-                file.unlink(missing_ok=True)
+            for folder in seed_folders(trial_folder(self.folder, number)):
+                (folder / LAST_CHECKPOINT).unlink(missing_ok=True)
 
     def tags_of(self, trial: FrozenTrial | Trial) -> dict[str, str]:
         """Return the tags that identify the tracked runs of a trial."""

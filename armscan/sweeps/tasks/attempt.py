@@ -251,6 +251,16 @@ def trial_folder(study_folder: Path, number: int) -> Path:
     return study_folder / "trials" / f"{number:0{TRIAL_DIGITS}}"
 
 
+def seed_folder(folder: Path, seed: int) -> Path:
+    """Return the folder of a training, in that of its trial."""
+    return folder / f"seed_{seed}"
+
+
+def seed_folders(folder: Path) -> list[Path]:
+    """Return the folders of a trial's trainings."""
+    return sorted(folder.glob("seed_*"))
+
+
 def config_sha256(config: Mapping[str, Any]) -> str:
     """Return the SHA-256 of a configuration's values except the seed, by which the runs of one trial differ."""
     return _sha256({key: value for key, value in config.items() if key != "seed"})

@@ -31,11 +31,11 @@ from armscan.experiment.results import RunResult
 from armscan.experiment.runner import keep_results, train_agent
 from armscan.sweeps.scheduling.limits import LimitReachedError
 from armscan.sweeps.scheduling.state import TEST_PREFIX
-from armscan.sweeps.tasks.attempt import TAKEN_OVER, Attempt, over_seeds, volumes_of
+from armscan.sweeps.tasks.attempt import TAKEN_OVER, Attempt, over_seeds, seed_folder, volumes_of
 from armscan.sweeps.tasks.generation import begin_generation
 from armscan.sweeps.tasks.reporter import TRAINING_METRICS, Reporter
 from armscan.tracking import TrackedRun, TrackingStore, draw_learning_curve, open_store, run_of_study, take_over
-from armscan.tracking.tags import PARENT_TAG, SELECTION_PREFIX, STUDY_TAG
+from armscan.tracking.tags import PARENT_TAG, SELECTION_PREFIX, STUDY_TAG, VALIDATION_PREFIX
 from armscan.training import (
     TEST,
     VALIDATION,
@@ -89,7 +89,7 @@ class TrainingTask:
         """
         for seed in attempt.seeds:
             # In a population, the next generation begins from this folder, and not from that of an earlier attempt.
-            is_elsewhere = attempt.interval is not None and not (_folder_of(attempt, seed) / RUN_FILE).exists()
+            is_elsewhere = attempt.interval is not None and not (seed_folder(attempt.folder, seed) / RUN_FILE).exists()
             if seed not in attempt.seeds_done or is_elsewhere:
                 attempt.keep_seed(seed, _train(attempt, seed))
             else:
@@ -143,15 +143,11 @@ def _evaluate_on_test(
     return metrics
 
 
-def _folder_of(attempt: Attempt, seed: int) -> Path:
-    return attempt.folder / f"seed_{seed}"
-
-
 def _train(attempt: Attempt, seed: int, conclude: Conclude | None = None) -> dict[str, float]:
     """Train with one seed, from the last checkpoint if there is one; return metrics, including those of `conclude`."""
     config, choices = attempt.config(seed)
     setup = set_up(config)
-    folder = _folder_of(attempt, seed)
+    folder = seed_folder(attempt.folder, seed)
     folder.mkdir(parents=True, exist_ok=True)
     reporter = Reporter(attempt, seed, setup.budget)
     pruned, concluded = None, {}
@@ -194,7 +190,7 @@ def _train(attempt: Attempt, seed: int, conclude: Conclude | None = None) -> dic
 
 def _adopt(attempt: Attempt, seed: int) -> None:
     """Move a finished training of an earlier attempt to this one: its files, and its run below that of the trial."""
-    folder = _folder_of(attempt, seed)
+    folder = seed_folder(attempt.folder, seed)
     if (folder / RUN_FILE).exists():
         return
     folder.mkdir(parents=True, exist_ok=True)
@@ -233,7 +229,7 @@ def _start_or_resume(
                 setup = set_up(config)
             else:
                 return setup, reopen(), earlier
-        elif not any(name.startswith("validation/") for name in run.data.metrics):
+        elif not any(name.startswith(VALIDATION_PREFIX) for name in run.data.metrics):
             # It was interrupted before the end of its first epoch.
             return setup, reopen(), None
     invocation = Invocation(folder, attempt.overrides, attempt.command, choices)

@@ -9,6 +9,8 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator
 
+from optuna.trial import FrozenTrial
+
 from armscan.errors import ArmscanError, StorageUnavailableError
 from armscan.sweeps.scheduling.state import BEAT_S
 from armscan.sweeps.storage.attribute_names import LEASE
@@ -44,21 +46,20 @@ class StudyMonitor:
 
     def is_alive(self) -> bool:
         """Return whether the worker of any running trial is alive."""
-        return any(
-            not self._liveness[phase.name].is_dead(trial)
-            for phase in self._opened.phases
-            for trial in phase.scheduler.state().running
-        )
+        return any(True for _ in self._live_trials())
 
     def is_worked_on(self) -> bool:
         """Return whether a running trial has a live worker that has renewed its lease within `LIFELESS_S`."""
         now_s = time.time()
-        return any(
-            now_s - trial.user_attrs.get(LEASE, {}).get(BEAT_S, 0.0) < LIFELESS_S
-            and not self._liveness[phase.name].is_dead(trial)
-            for phase in self._opened.phases
-            for trial in phase.scheduler.state().running
-        )
+        beats_s = (trial.user_attrs.get(LEASE, {}).get(BEAT_S, 0.0) for trial in self._live_trials())
+        return any(now_s - beat_s < LIFELESS_S for beat_s in beats_s)
+
+    def _live_trials(self) -> Iterator[FrozenTrial]:
+        """Yield the running trials whose workers are not dead."""
+        for phase in self._opened.phases:
+            for trial in phase.scheduler.state().running:
+                if not self._liveness[phase.name].is_dead(trial):
+                    yield trial
 
     def wait_until_over(self) -> bool:
         """Wait as long as any worker is alive; return whether the study is over then."""

@@ -20,13 +20,13 @@ from armscan.errors import ArmscanError, ServiceUnavailableError, StudyError
 from armscan.sweeps.workers.leave_request import LeaveRequest
 from armscan.sweeps.workers.slurm import NOW, SOON, SlurmSignals
 from armscan.utils.log import log
-from armscan.utils.processes import ProcessInfo, child_command, on_parent_exit
+from armscan.utils.processes import EXIT_INTERRUPTED, ProcessInfo, child_command, on_parent_exit
 
 LAUNCHER_FILE, STOP_FILE, WORKER_FILES = "launcher.json", "stop", "worker-*.json"
-# Exit codes of a worker that was told to leave, of one whose storage or tracking store was unavailable for
-# too long, of one that cannot work on the study as it is stored, and of all that are not restarted.
-LEFT, UNAVAILABLE, REFUSED = 130, 75, 65
-ENDS = (0, LEFT, UNAVAILABLE, REFUSED)
+# Exit codes of a worker whose storage or tracking store was unavailable for too long, of one that cannot work on the
+# study as it is stored, and of all that are not restarted: those that were told to leave, too.
+UNAVAILABLE, REFUSED = 75, 65
+ENDS = (0, EXIT_INTERRUPTED, UNAVAILABLE, REFUSED)
 GPUS, KEPT_GPUS, ALL_GPUS = "CUDA_VISIBLE_DEVICES", "ARMSCAN_GPUS", "all"
 # A worker that is killed again and again does no work; by then its trials have failed.
 MAX_RESTARTS = 100
@@ -133,7 +133,7 @@ def worker_main(supervisor_pid: int) -> None:
         worker=f"{folder.name}/{number}",
         should_leave=should_leave,
         should_leave_soon=lambda: request.is_soon,
-        leave=partial(os._exit, LEFT),
+        leave=partial(os._exit, EXIT_INTERRUPTED),
     )
     try:
         work(overrides, make_heartbeat)

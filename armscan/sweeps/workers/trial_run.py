@@ -25,6 +25,7 @@ from armscan.tracking.tags import (
     SELECTION_PREFIX,
     STUDY_TAG,
     TRIAL_TAG,
+    VALIDATION_PREFIX,
 )
 from armscan.utils.run_files import CONFIG_FILE, SHA256_TAGS
 
@@ -95,7 +96,7 @@ def end_run(
         metrics: Its metrics; empty if it was pruned or has failed.
         reason: Why it has failed. Default: None, it has not.
     """
-    prefix = SELECTION_PREFIX if phase.name.endswith(SELECTION_SUFFIX) else "validation/"
+    prefix = SELECTION_PREFIX if phase.name.endswith(SELECTION_SUFFIX) else VALIDATION_PREFIX
     named = named_as_of_runs(metrics, len(phase.seeds_of(trial)), prefix)
     tracked.log_metrics({**metrics, **named}, n_env_steps=0)
     if state == TrialState.PRUNED:
