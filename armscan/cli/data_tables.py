@@ -95,7 +95,7 @@ def _tissue_table(report: VolumeReport) -> Table:
     from armscan.volumes import LABEL_NAMES
     from armscan.volumes.labelmap import shown
 
-    numbers = (Column(name, justify="right", no_wrap=True) for name in ("voxels", "mm3"))
+    numbers = (Column(name, justify="right", no_wrap=True) for name in ("voxels", "mm³"))
     table = Table(Column("tissue", no_wrap=True), "in the file (voxels)", *numbers)
     for value, tissue in LABEL_NAMES.items():
         sources = ", ".join(f"{each.source} ({each.n_voxels})" for each in report.stored.found if each.label == value)

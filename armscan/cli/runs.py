@@ -73,7 +73,7 @@ def runs() -> None:
 
 @runs.command(
     "list",
-    epilog=examples("runs list --status failed,killed --since 7d", "runs list --agent sac --sort -success --limit 5"),
+    epilog=examples("runs list --status failed,killed --since 7d", "runs list --agent sac --sort -plane --limit 5"),
 )
 @_with_selection
 @click.option("--format", "form", type=click.Choice(["table", "csv", "json"]), default="table", help="Output format.")
@@ -142,7 +142,7 @@ def prune(what: str, apply: bool, tracking: str, sort: str, limit: int | None, *
     freed = decimal(sum(item.n_bytes for item in taken))
     print(f"{what} of {len(taken)} of {len(items)} runs would be removed, {freed}; nothing was removed")
     if unfinished := [item for item in taken if what == CHECKPOINTS and item.run.info.status != "FINISHED"]:
-        print(f"note: {counted(len(unfinished), 'run')} did not finish: these checkpoints are the only copies")
+        print(f"note: {counted(len(unfinished), 'run')} did not finish: these checkpoints may be the only copies")
     if taken:
         print(f"remove it {armscan_command(*click.get_current_context().obj, '--apply')}")
     return 0

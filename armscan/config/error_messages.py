@@ -58,8 +58,13 @@ def one_line_message(error: BaseException) -> str | None:
         case MissingMandatoryValue():
             return f"{error.full_key} is not set, but it must be: give {error.full_key}=VALUE"
         case InstantiationException(__cause__=ImportError(__cause__=ImportError() as missing)):
-            key = text.rpartition("full_key: ")[2]
+            key, (module, _, name) = text.rpartition("full_key: ")[2], str(missing.name).rpartition(".")
+            if f"{module!r} is not a package" in str(missing):
+                return f"{key}._target_ cannot be imported: {module} has no {name}"
             return f"{key}._target_ cannot be imported: {missing}; it must be in the current folder, or installed"
+        case InstantiationException(__cause__=ImportError(__cause__=Exception() as failed)):
+            key = text.rpartition("full_key: ")[2]
+            return f"{key}._target_ cannot be imported: {type(failed).__name__}: {in_one_line(failed)}"
         case HydraException() | OmegaConfBaseException():
             return text
         # Raised by Hydra for an override such as obs=null.

@@ -14,7 +14,7 @@ from armscan.envs.rules import ON_BUDGET, ON_REWARD
 from armscan.errors import InvalidValueError, OptimalPlaneError
 from armscan.evaluation.agent_source import EvaluatedAgent
 from armscan.evaluation.runner import prepare_on_volumes
-from armscan.evaluation.volumes import own_split
+from armscan.evaluation.volumes import orientation_notes, own_split
 from armscan.training.episode_seeds import EVALUATION_SEED
 from armscan.utils.console import print_sentence
 from armscan.volumes import LabelVolume, ManipulatorAction
@@ -64,7 +64,7 @@ class AgentSearch:
         """
         volumes = {volume.name: self._with_any_plane(volume)}
         prepared = prepare_on_volumes(self._source, {volume.name: volumes}, self._own)
-        for note in prepared.notes:
+        for note in (*prepared.notes, *orientation_notes({volume.name: volumes})):
             print_sentence(f"note: {note}")
         agent, env = prepared.agent, prepared.envs[volume.name]
         observation, info = env.reset(seed=EVALUATION_SEED)

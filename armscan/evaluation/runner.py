@@ -19,6 +19,7 @@ from armscan.evaluation.volumes import (
     VolumesByName,
     are_known,
     known_volumes,
+    orientation_notes,
     own_split,
     phantom_version,
     volume_groups,
@@ -113,7 +114,7 @@ def prepare_agent(
     groups = volume_groups(data, n_phantoms, own, phantom_version(source))
     check(groups)
     prepared = prepare_on_volumes(source, groups, own, render_mode=render_mode)
-    notes = list(prepared.notes)
+    notes = [*prepared.notes, *(orientation_notes(groups) if data else [])]
     is_elsewhere = bool(data and source.run)
     known = known_volumes(source, groups) if is_elsewhere else []
     own_groups = [label for label, volumes in groups.items() if is_elsewhere and are_known(source, volumes)]

@@ -184,5 +184,7 @@ def run_name(config: dict[str, Any], choices: dict[str, str]) -> str:
     projection = rules["projection"]
     parts = [choices["agent"], choices["obs"], projection if isinstance(projection, str) else "+".join(projection)]
     parts += [f"{name}{rules[name]}" for name, without in (("stack", 1), ("memory", 0)) if rules[name] != without]
+    # By another reward, success is something else.
+    parts += [choices["reward"]] * (choices["reward"] != "published")
     fold = config["data"].get("fold")
     return "-".join([*parts, choices["data"], *([] if fold is None else [f"fold{fold}"]), f"seed{config['seed']}"])

@@ -103,6 +103,8 @@ def run_tracked(
     tell(f"run {tracked.run_id}: {tracked.name}")
     if names := setup.split.description:
         tell(names)
+    if note := setup.split.orientation_note:
+        tell(f"note: {note}")
     trust = setup.needs_trust
     again = resume_command(tracked.run_id, tracking_uri, trust=trust)
     hint = _resume_hint_on_error(tracked, again, folder, is_told=job_label is None)

@@ -90,8 +90,10 @@ def write_comparison(groups: Sequence[Group], left_out: Sequence[TrackedTraining
     tables = all_numbers(groups, curves, reached, pairs, baselines)
     titles = validation_titles(metrics)
     has_other_volumes = any(each.probability is None for each in pairs["on_plane_rate"])
+    none_best = "No best group: the groups were judged in different tasks, or on different test volumes."
+    lead = final.headline or (none_best if sum(each is not None for each in reached) > 1 else "")
     parts = [
-        f"<p><strong>{html.escape(final.headline)}</strong></p>" if final.headline else "",
+        f"<p><strong>{html.escape(lead)}</strong></p>" if lead else "",
         _summary(groups),
         notes_on(groups, left_out, curves, reached, has_other_volumes=has_other_volumes),
         *_learning(groups, curves),

@@ -15,7 +15,9 @@ from armscan.stats.aggregation import MIN_SEEDS
 from armscan.tracking.tags import OWN_CODE_TAG
 from armscan.training.headline import MIN_SUBJECTS
 from armscan.training.metrics import MetricEstimates
+from armscan.training.splits import PARTS
 from armscan.utils.run_files import ID_CHARS
+from armscan.volumes.phantom.generate import PHANTOM_NAME
 
 # From this number of seeds on, the intervals of final figures are nearly as wide as they should be.
 MANY_SEEDS = 5
@@ -67,11 +69,23 @@ def _on_folds(groups: Sequence[Group]) -> Iterator[str]:
             "each volume tested on by trainings that have not seen it, and intervals draw subjects. In learning curves "
             "each fold of a seed is a line."
         )
+        own = _own_volumes(group.trainings, PARTS)
+        if untested := sorted(own - _own_volumes(group.tested, ["test"])):
+            yield (
+                f"Group {group.number}: {len(untested)} of its {len(own)} volumes were not tested on, so the figures "
+                f"are without {few(untested)}."
+            )
         if left_out := ", ".join(sorted(str(fold) for fold in folds - tested)):
             yield (
                 f"Group {group.number}: not all seeds were tested on fold {left_out}, which is left out of the figures "
                 "on the test volumes."
             )
+
+
+def _own_volumes(trainings: Sequence[TrackedTraining], parts: Sequence[str]) -> set[str]:
+    """Return the names of the volumes in these parts, without phantoms."""
+    named = (name for each in trainings for part in parts for name in (each.volumes or {}).get(part, {}))
+    return {name for name in named if not PHANTOM_NAME.fullmatch(name)}
 
 
 def _on_seeds(groups: Sequence[Group]) -> Iterator[str]:

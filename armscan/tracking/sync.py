@@ -172,8 +172,11 @@ def _end(outbox: Outbox, run: Run) -> None:
     if run.info.status in ENDED and run.info.end_time is not None and run.info.end_time >= begun_ms:
         outbox.add(status=(run.info.status, run.info.end_time))
     else:
+        # It died after its last metric; nobody knows when, if it has none.
+        times_ms = (point[2] for each in outbox.entries() for point in each.get("metrics", ()))
+        ended_ms = max(times_ms, default=now_ms())
         outbox.add(tags={FAILURE_TAG: PROCESS_DIED})
-        outbox.add(status=("FAILED", now_ms()))
+        outbox.add(status=("FAILED", max(ended_ms, begun_ms)))
 
 
 def _check_own(outbox: Outbox, run: Run) -> None:
@@ -205,7 +208,8 @@ def _upload_pending(store: TrackingStore) -> None:
         uploads = _synced([pending.outbox], opened, trust=False)
         for each in uploads:
             if each.n_entries:
-                log(f"run {each.run_id}: uploaded {each.n_entries} entries that it had left")
+                entries = "1 entry" if each.n_entries == 1 else f"{each.n_entries} entries"
+                log(f"run {each.run_id}: uploaded {entries} that it had left")
         # A run in progress stays pending. So does one of another machine that shares this cache, as its folder may
         # be local to that machine. A process of an earlier boot has ended; an earlier version recorded no process.
         process = pending.process

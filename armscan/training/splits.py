@@ -86,6 +86,16 @@ class Split:
             of_parts.append(f"{part}: {' and '.join([few(own, N_NAMED)] * bool(own) + phantoms)}")
         return "; ".join(of_parts)
 
+    @property
+    def orientation_note(self) -> str | None:
+        """A note if there are phantoms, and volumes whose palm is on the other side; None if they agree."""
+        volumes = {name: volume for of_part in self.parts.values() for name, volume in of_part.items()}
+        turned = [name for name, volume in volumes.items() if not volume.has_palm_at_high_z]
+        if not turned or not any(PHANTOM_NAME.fullmatch(name) for name in volumes):
+            return None
+        shown = few(turned, N_NAMED)
+        return f"the palm is at low z in {shown}, in phantoms at high z; orientation in the manifest flips axes"
+
     def fingerprints(self) -> Fingerprints:
         """Return a checksum of each volume's contents, by part and name."""
         return {

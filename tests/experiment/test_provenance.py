@@ -21,6 +21,7 @@ from tests.support.tracked_runs import FEW
         (["env.projection=zy", "env.stack=2", "env.memory=1"], "random-cluster-zy-stack2-memory1-phantom-seed0"),
         (["env.observation=[slice,cluster]"], "random-slice+cluster-y-phantom-seed0"),
         (["obs=slice", "env.observation=cluster"], "random-cluster-y-phantom-seed0"),
+        (["reward=agreement", "env.success_threshold=0.5"], "random-cluster-y-agreement-phantom-seed0"),
     ],
 )
 def test_name_and_tags_of_a_run_are_of_its_environment(tmp_path, database, monkeypatch, words, name):

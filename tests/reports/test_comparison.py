@@ -167,7 +167,7 @@ def test_folds_of_a_grid_are_one_configuration_with_intervals_by_wrist(written, 
             params={"data.folds": "leave_one_out", "data.fold": str(number)},
             run_id=f"{10 * seed + number:032x}",
             evaluation=Evaluation(tuple(make_episode(volume, mean_steps) for _ in range(4))),
-            volumes={"test": {volume: volume}},
+            volumes={"training": {f"w{other}": "" for other in range(3) if other != number}, "test": {volume: ""}},
         )
 
     trainings = [fold(seed, number, steps) for seed in range(2) for number, steps in enumerate((2, 4, 9))]
@@ -181,9 +181,11 @@ def test_folds_of_a_grid_are_one_configuration_with_intervals_by_wrist(written, 
     page, _ = written(*trainings)
     assert "is a cross-validation: the figures on the test volumes are over 3 folds, each" in page
     assert "differ by nothing but the seed and the fold" in page
+    assert "not tested on" not in page
     page, _ = written(*trainings[:-1])
     assert "the figures on the test volumes are over 2 folds" in page
     assert "not all seeds were tested on fold 2, which is left out of the figures on the test volumes" in page
+    assert "Group 1: 1 of its 3 volumes were not tested on, so the figures are without w2." in page
     (group,), _ = group_trainings(trainings[:-1])
     assert final_metrics(group).estimates["mean_steps"].value == 3.0
 

@@ -100,6 +100,15 @@ def test_end_that_the_store_has_already_stays(uri, run_id, tmp_path):
     assert store.get_run(run_id).info.end_time == ended_ms
 
 
+def test_run_whose_process_died_ended_with_its_last_metric(uri, run_id, tmp_path):
+    with contextlib.closing(Outbox(file_of(tmp_path / "run", run_id))) as outbox:
+        outbox.add(status=("RUNNING", 1_000))
+        outbox.add(metrics=[["a", 0.5, 3_000, 1], ["a", 0.5, 9_000, 2]])
+    sync(tmp_path, open_existing_store)
+    assert ending_of(uri, run_id) == ("FAILED", PROCESS_DIED)
+    assert open_existing_store(uri).get_run(run_id).info.end_time == 9_000
+
+
 def test_end_before_the_run_was_resumed_is_not_its_end(uri, run_id, tmp_path):
     store = open_existing_store(uri)
     store.set_tag(run_id, "failure", "interrupted")
