@@ -58,6 +58,7 @@ HOW_BETTER = (
 
 # With more groups, the pairwise comparison is folded.
 MANY_PAIRS = 12
+NO_BEST = "No best group: the groups were judged in different tasks, or on different test volumes."
 # With more groups, nobody can tell the bands apart.
 MAX_DETAILED = 24
 
@@ -90,10 +91,8 @@ def write_comparison(groups: Sequence[Group], left_out: Sequence[TrackedTraining
     tables = all_numbers(groups, curves, reached, pairs, baselines)
     titles = validation_titles(metrics)
     has_other_volumes = any(each.probability is None for each in pairs["on_plane_rate"])
-    none_best = "No best group: the groups were judged in different tasks, or on different test volumes."
-    lead = final.headline or (none_best if sum(each is not None for each in reached) > 1 else "")
     parts = [
-        f"<p><strong>{html.escape(lead)}</strong></p>" if lead else "",
+        f"<p><strong>{html.escape(final.headline)}</strong></p>" if final.headline else "",
         _summary(groups),
         notes_on(groups, left_out, curves, reached, has_other_volumes=has_other_volumes),
         *_learning(groups, curves),
@@ -189,7 +188,8 @@ def final_table(groups: Sequence[Group], reached: Sequence[MetricEstimates | Non
     randoms = {label: each[RANDOM] for label, each in baselines.items() if RANDOM in each}
     # The best of several tasks is the easiest.
     is_one_task = have_same_volumes(evaluated) and not differing_rules(evaluated)
-    return ResultTable(with_baselines(metrics, baselines), headline=headline(metrics, randoms) if is_one_task else "")
+    best = headline(metrics, randoms) if is_one_task else NO_BEST if len(evaluated) > 1 else ""
+    return ResultTable(with_baselines(metrics, baselines), headline=best)
 
 
 def _better(groups: Sequence[Group], pairs: Mapping[str, Sequence[Pair]]) -> Iterator[str]:

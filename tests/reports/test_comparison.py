@@ -200,6 +200,7 @@ def test_headline_names_no_best_of_groups_with_other_volumes_or_rules(written, m
     page, _ = written(*rates.values())
     assert "best of 2, chosen on these volumes" in page
     page, _ = written(rates["a"], make_training(0, params={"env.max_steps": "9"}))
+    assert "<strong>No best group: the groups were judged in different tasks" in page
     assert "chosen on these volumes" not in page
     other = {"test": {"v1": "another"}}
     page, _ = written(rates["a"], make_training(0, params={"agent.lr": "0.2"}, volumes=other))
