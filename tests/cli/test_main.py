@@ -154,7 +154,7 @@ def test_classes_in_the_current_folder_are_found(words, tmp_path):
     assert "agent._target_ cannot be imported: No module named 'own_agent'" in error()
     (tmp_path / "own_agent.py").write_text("raise ImportError('it was found')")
     assert "agent._target_ cannot be imported: it was found" in error()
-    (tmp_path / "own_agent.py").write_text("class Midle: ...")
+    (tmp_path / "own_agent.py").write_text("class Left: ...")
     assert "agent._target_ cannot be imported: own_agent has no Middle" in error()
     (tmp_path / "own_agent.py").write_text("class Middle")
     assert "agent._target_ cannot be imported: SyntaxError: " in error()
