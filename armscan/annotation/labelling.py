@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 
@@ -12,7 +14,7 @@ from PIL import Image
 
 from armscan.anatomy import FoundPlane, LandmarkReward, PlaneScorer, Tissues, find_optimal_plane
 from armscan.envs.rendering import ReferencePlane, draw_plane, view_of
-from armscan.errors import ArmscanError, InvalidValueError, MarkupError, OptimalPlaneError, listed
+from armscan.errors import ArmscanError, InvalidValueError, ManifestError, MarkupError, OptimalPlaneError, listed
 from armscan.utils.console import print_sentence
 from armscan.utils.files import atomic_write
 from armscan.volumes import (
@@ -24,6 +26,7 @@ from armscan.volumes import (
     record_planes,
     write_markup,
 )
+from armscan.volumes.manifest import find_manifest
 from armscan.volumes.markups import MARKUP_SUFFIX
 from armscan.volumes.plane import shift_into
 
@@ -72,6 +75,8 @@ def label(options: LabellingOptions) -> tuple[list[tuple[LabelVolume, FoundPlane
     if options.markups and options.markup is None:
         _write_known_markups(options, dataset.volumes, set(volumes))
     find = _search(options)
+    if options.overwrite and any(volume.optimal_action is not None for volume in volumes.values()):
+        _keep_manifest(options.data)
     labelled: list[tuple[LabelVolume, FoundPlane]] = []
     failures: list[ArmscanError] = []
     for number, (name, volume) in enumerate(volumes.items(), 1):
@@ -90,6 +95,18 @@ def label(options: LabellingOptions) -> tuple[list[tuple[LabelVolume, FoundPlane
         record_planes(options.data, {name: (plane.action, plane.score)}, read_with=dataset.manifest)
         labelled.append((volume, plane))
     return labelled, failures
+
+
+def _keep_manifest(folder: Path) -> None:
+    """Copy the manifest, whose planes are about to be replaced: a person may have corrected them."""
+    manifest = find_manifest(folder)
+    assert manifest is not None, "a volume has a plane"
+    kept = manifest.with_name(f"{manifest.name}.{datetime.now():%Y-%m-%d_%H-%M-%S}.bak")
+    try:
+        shutil.copyfile(manifest, kept)
+    except OSError as error:
+        raise ManifestError(f"{kept}: the former planes cannot be kept there ({error.strerror})") from error
+    print(f"the former planes are kept in {kept}")
 
 
 def _wanted(options: LabellingOptions, dataset: Dataset) -> dict[str, LabelVolume]:

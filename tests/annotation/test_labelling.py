@@ -94,8 +94,12 @@ def test_label_leaves_planes_that_are_there_unless_told_otherwise(bare, names, q
     capsys.readouterr()
     assert main(["data", "label", str(bare)]) == 0
     assert "every volume has a plane already" in capsys.readouterr().out
+    before = (bare / "manifest.yaml").read_bytes()
     assert main(["data", "label", str(bare), f"--volumes={names[0]}", "--overwrite"]) == 0
     assert planes(bare)[names[0]] == first
+    (kept,) = bare.glob("manifest.yaml.*.bak")
+    assert kept.read_bytes() == before
+    assert f"the former planes are kept in {kept}\n" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(("clustering", "is_noted"), [("pixels", True), ("metric", False)])
