@@ -105,14 +105,15 @@ def repeat_grid(grid: GridToRepeat) -> None:
     launch([MULTIRUN[0], *grid.overrides])
 
 
-def _end_interrupted() -> None:
-    """Close a grid that was interrupted; a second interrupt leaves that to `armscan runs sync`."""
+def _end_grid(*, is_interrupted: bool) -> int:
+    """Close a grid, and return the exit code; an interrupt meanwhile leaves that to `armscan runs sync`."""
     try:
-        end_grid(is_interrupted=True)
+        return end_grid(is_interrupted=is_interrupted)
     except (KeyboardInterrupt, Exception) as error:
         if not is_interruption(error):
             raise
         print_resume_command()
+        return EXIT_INTERRUPTED
 
 
 def main() -> int:
@@ -162,9 +163,9 @@ def main() -> int:
             end_grid()
             raise_or_exit(error)
     else:
-        return end_grid()
+        return _end_grid(is_interrupted=False)
     # Not in the handler, where every further error would seem to follow from the interruption.
-    _end_interrupted()
+    _end_grid(is_interrupted=True)
     print(INTERRUPTED, file=sys.stderr)
     return EXIT_INTERRUPTED
 

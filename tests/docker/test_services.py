@@ -14,7 +14,7 @@ import psycopg
 import pytest
 from mlflow import MlflowClient
 
-from armscan.sweeps.workers.supervisor import LEFT
+from armscan.utils.processes import EXIT_INTERRUPTED
 from tests.docker.containers import SECRETS, Containers
 from tests.docker.files import FOLDER
 from tests.docker.image import ImageContainers, built_image
@@ -153,7 +153,7 @@ def test_study_on_the_services_is_stopped_and_gone_on_with(containers, postgres_
     words = command_lines(f"ARMSCAN_STORAGE_PASSWORD_FILE={containers.here(SECRET)}")
     assert len(words) >= 5
     assert [each for each in words if PASSWORD.encode() in each] == []
-    assert containers.stop("worker") == LEFT, containers.log("worker")
+    assert containers.stop("worker") == EXIT_INTERRUPTED, containers.log("worker")
     assert states(postgres_there) == ["WAITING"]
     assert not containers.is_healthy("worker")
 

@@ -33,11 +33,12 @@ def test_address_of_the_store_is_read_again_as_it_was(uri):
     assert OverridesParser.create().parse_override(word).value() == uri
 
 
-def test_second_interrupt_leaves_the_command_that_resumes_the_grid(tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize("is_interrupted", [True, False])
+def test_interrupt_while_a_grid_is_closed_leaves_the_command_that_resumes_it(monkeypatch, capsys, is_interrupted):
     grid = Grid(run_id="a" * 32, tracking={"uri": "sqlite:///mine.db"}, overrides=[], shared=[])
     monkeypatch.setattr(Multirun, "grid", grid)
     monkeypatch.setattr(run, "end_grid", Mock(side_effect=KeyboardInterrupt))
-    run._end_interrupted()
+    assert run._end_grid(is_interrupted=is_interrupted) == 130
     told = capsys.readouterr().err
     assert told.startswith("the grid was not closed; resume it with: ")
     assert f"resume={'a' * 32} tracking.uri=sqlite:///mine.db" in told
