@@ -10,6 +10,7 @@ from __future__ import annotations
 import subprocess
 import sys
 
+from benchmarks.arguments import parser_of
 from benchmarks.tables import print_head, print_row
 
 N_PROCESSES = 5
@@ -42,6 +43,7 @@ def seconds(program: str) -> float:
 
 def main() -> None:
     """Print the table."""
+    parser_of(__doc__).parse_args()
     print_head("", "seconds")
     for name, program in PROGRAMS.items():
         seconds(program)

@@ -16,6 +16,7 @@ from armscan.reports.chart_style import BLUE, GREY, ORANGE
 from armscan.stats.aggregation import probability_of_improvement
 from armscan.stats.paired import paired_difference
 from armscan.sweeps.scheduling.race import MAX_SEEDS_FACTOR, Race, race
+from benchmarks.arguments import parser_of
 from benchmarks.repository import PICTURES
 
 N_TRIALS, N_VALIDATION, N_TEST, N_JUDGING = 30, 8, 12, 5
@@ -31,6 +32,7 @@ PAPER = {"facecolor": "white", "edgecolor": "none", "pad": 1.5}
 
 def main() -> None:
     """Simulate the study and draw it."""
+    parser_of(__doc__).parse_args()
     rng = np.random.default_rng(SEED)
     true = np.clip(1.5 + rng.gamma(1.6, 1.1, N_TRIALS), 1.5, 8.0)
     seen = np.maximum(1.0, true + LUCK * rng.standard_normal(N_TRIALS))
