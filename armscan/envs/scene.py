@@ -171,7 +171,7 @@ class SceneSampler:
         """
         if volume.optimal_action is None:
             raise OptimalPlaneError(
-                f"{volume.name}: has no labelled plane, which an environment needs; armscan data label finds it"
+                f"{volume.name}: has no labelled plane, which an environment needs; armscan data label FOLDER finds it"
             )
         turns = (0.0, 0.0) if self.transform is None else (self.transform.rz_deg, self.transform.rx_deg)
         for name, angle, turn, bound in zip(
