@@ -10,7 +10,7 @@ from armscan.agents import Agent, Learner
 from armscan.anatomy import USUAL_PIXEL_MM
 from armscan.anatomy.tissues import MAX_METRIC_PIXEL_MM
 from armscan.config.command_hints import resume_command
-from armscan.config.defaults import to_plain
+from armscan.config.defaults import PHANTOM, to_plain
 from armscan.envs import EnvFactory
 from armscan.errors import CheckpointError, InvalidValueError, OptimalPlaneError, listed, printable, reason_of
 from armscan.evaluation.agent_source import EvaluatedAgent
@@ -114,7 +114,7 @@ def prepare_agent(
     groups = volume_groups(data, n_phantoms, own, phantom_version(source))
     check(groups)
     prepared = prepare_on_volumes(source, groups, own, render_mode=render_mode)
-    notes = [*prepared.notes, *(orientation_notes(groups) if data else [])]
+    notes = [*prepared.notes, *(orientation_notes(groups) if data not in (None, PHANTOM) else [])]
     is_elsewhere = bool(data and source.run)
     known = known_volumes(source, groups) if is_elsewhere else []
     own_groups = [label for label, volumes in groups.items() if is_elsewhere and are_known(source, volumes)]

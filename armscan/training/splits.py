@@ -90,8 +90,10 @@ class Split:
     def orientation_note(self) -> str | None:
         """A note if there are phantoms, and volumes whose palm is on the other side; None if they agree."""
         volumes = {name: volume for of_part in self.parts.values() for name, volume in of_part.items()}
-        turned = [name for name, volume in volumes.items() if not volume.has_palm_at_high_z]
-        if not turned or not any(PHANTOM_NAME.fullmatch(name) for name in volumes):
+        own = [name for name in volumes if not PHANTOM_NAME.fullmatch(name)]
+        # Only beside phantoms: all voxels are read.
+        turned = [name for name in own if len(own) < len(volumes) and not volumes[name].has_palm_at_high_z]
+        if not turned:
             return None
         shown = few(turned, N_NAMED)
         return f"the palm is at low z in {shown}, in phantoms at high z; orientation in the manifest flips axes"

@@ -12,7 +12,7 @@ from hypothesis import given
 from armscan.errors import InvalidValueError
 from armscan.training import Split, mixed_data, nifti_data, phantom_data
 from armscan.training.subject_splits import _drawn
-from armscan.volumes import ManipulatorAction
+from armscan.volumes import LabelVolume, ManipulatorAction
 from tests.volumes.test_damaged import SETTINGS, anything, is_answered
 
 
@@ -36,6 +36,16 @@ def test_split_names_volumes_of_files_and_counts_phantoms(folder):
     assert split.description == (
         "training: a.nrrd, b.nrrd, c.nrrd, d.nrrd, e.nrrd and 1 phantom; validation: 2 phantoms; test: f.nrrd"
     )
+
+
+def test_wrists_whose_palm_is_on_the_other_side_than_in_phantoms_beside_them_are_noted(folder, monkeypatch):
+    mixed = mixed_data(folder(), validation="phantoms", test=["V"], n_training=1, n_validation=2)
+    alone = nifti_data(folder())
+    for is_high, noted in ((True, False), (False, True)):
+        monkeypatch.setattr(LabelVolume, "has_palm_at_high_z", is_high)
+        assert bool(mixed.orientation_note) == noted
+        assert alone.orientation_note is None
+    assert "the palm is at low z in a.nrrd, b.nrrd, c.nrrd" in mixed.orientation_note
 
 
 @pytest.mark.parametrize(
