@@ -57,14 +57,8 @@ def one_line_message(error: BaseException) -> str | None:
             return f"{error.override!r} cannot be read: what follows the options must be key=value"
         case MissingMandatoryValue():
             return f"{error.full_key} is not set, but it must be: give {error.full_key}=VALUE"
-        case InstantiationException(__cause__=ImportError(__cause__=ImportError() as missing)):
-            key, (module, _, name) = text.rpartition("full_key: ")[2], str(missing.name).rpartition(".")
-            if f"{module!r} is not a package" in str(missing):
-                return f"{key}._target_ cannot be imported: {module} has no {name}"
-            return f"{key}._target_ cannot be imported: {missing}; it must be in the current folder, or installed"
         case InstantiationException(__cause__=ImportError(__cause__=Exception() as failed)):
-            key = text.rpartition("full_key: ")[2]
-            return f"{key}._target_ cannot be imported: {type(failed).__name__}: {in_one_line(failed)}"
+            return f"{text.rpartition('full_key: ')[2]}._target_ cannot be imported: {_why_not_imported(failed)}"
         case HydraException() | OmegaConfBaseException():
             return text
         # Raised by Hydra for an override such as obs=null.
@@ -77,6 +71,15 @@ def one_line_message(error: BaseException) -> str | None:
         case OSError() if error.errno in FULL_DISK:
             return f"a file cannot be written: {error.strerror}"
     return None
+
+
+def _why_not_imported(error: Exception) -> str:
+    if not isinstance(error, ImportError):
+        return f"{type(error).__name__}: {in_one_line(error)}"
+    module, _, name = str(error.name).rpartition(".")
+    if f"{module!r} is not a package" in str(error):
+        return f"{module} has no {name}"
+    return f"{error}; it must be in the current folder, or installed"
 
 
 def _named(message: str, section: str) -> str:

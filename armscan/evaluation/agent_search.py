@@ -14,10 +14,11 @@ from armscan.envs.rules import ON_BUDGET, ON_REWARD
 from armscan.errors import InvalidValueError, OptimalPlaneError
 from armscan.evaluation.agent_source import EvaluatedAgent
 from armscan.evaluation.runner import prepare_on_volumes
-from armscan.evaluation.volumes import orientation_notes, own_split
+from armscan.evaluation.volumes import own_split
 from armscan.training.episode_seeds import EVALUATION_SEED
 from armscan.utils.console import print_sentence
 from armscan.volumes import LabelVolume, ManipulatorAction
+from armscan.volumes.volume import palm_notes
 
 # Values of ty, as fractions of its range, at which a plane may show something.
 PLACES = (0.5, 0.4, 0.6, 0.3, 0.7, 0.2, 0.8)
@@ -64,7 +65,7 @@ class AgentSearch:
         """
         volumes = {volume.name: self._with_any_plane(volume)}
         prepared = prepare_on_volumes(self._source, {volume.name: volumes}, self._own)
-        for note in (*prepared.notes, *orientation_notes({volume.name: volumes})):
+        for note in (*prepared.notes, *palm_notes(volumes)):
             print_sentence(f"note: {note}")
         agent, env = prepared.agent, prepared.envs[volume.name]
         observation, info = env.reset(seed=EVALUATION_SEED)

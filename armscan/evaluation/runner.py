@@ -19,7 +19,6 @@ from armscan.evaluation.volumes import (
     VolumesByName,
     are_known,
     known_volumes,
-    orientation_notes,
     own_split,
     phantom_version,
     volume_groups,
@@ -33,6 +32,7 @@ from armscan.training.episode_results import Env
 from armscan.training.episode_seeds import EVALUATION_SEED
 from armscan.utils.console import print_sentence
 from armscan.utils.text import counted
+from armscan.volumes.volume import palm_notes
 
 PIXEL_TOLERANCE = 0.1
 
@@ -114,7 +114,9 @@ def prepare_agent(
     groups = volume_groups(data, n_phantoms, own, phantom_version(source))
     check(groups)
     prepared = prepare_on_volumes(source, groups, own, render_mode=render_mode)
-    notes = [*prepared.notes, *(orientation_notes(groups) if data not in (None, PHANTOM) else [])]
+    notes = list(prepared.notes)
+    if data not in (None, PHANTOM):
+        notes += palm_notes({name: volume for of_group in groups.values() for name, volume in of_group.items()})
     is_elsewhere = bool(data and source.run)
     known = known_volumes(source, groups) if is_elsewhere else []
     own_groups = [label for label, volumes in groups.items() if is_elsewhere and are_known(source, volumes)]

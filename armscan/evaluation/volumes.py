@@ -11,7 +11,7 @@ from hydra.utils import instantiate
 
 from armscan.config.defaults import PHANTOM
 from armscan.config.error_messages import one_line_message
-from armscan.errors import InvalidValueError, few
+from armscan.errors import InvalidValueError
 from armscan.evaluation.agent_source import EvaluatedAgent
 from armscan.tracking.tags import SUBJECTS, VOLUMES
 from armscan.training import PARTS, TEST, TRAINING, VALIDATION, Split, check_unchanged
@@ -114,14 +114,6 @@ def check_out(file: Path, out: Path | None, what: str) -> None:
     except OSError as error:
         named = str(out or file)
         raise InvalidValueError(f"--out is {named!r}, but no {what} can be written there: {error.strerror}") from error
-
-
-def orientation_notes(groups: Mapping[str, VolumesByName]) -> list[str]:
-    """Return a sentence if the palm of volumes is at low z, where agents of phantoms do not expect it."""
-    turned = [name for volumes in groups.values() for name, each in volumes.items() if not each.has_palm_at_high_z]
-    if not turned:
-        return []
-    return [f"the palm is at low z in {few(turned)}, in phantoms at high z: only an agent trained on such volumes fits"]
 
 
 def known_volumes(source: EvaluatedAgent, groups: Mapping[str, VolumesByName]) -> list[str]:

@@ -103,7 +103,7 @@ def run_tracked(
     tell(f"run {tracked.run_id}: {tracked.name}")
     if names := setup.split.description:
         tell(names)
-    if note := setup.split.orientation_note:
+    for note in setup.split.palm_notes:
         tell(f"note: {note}")
     trust = setup.needs_trust
     again = resume_command(tracked.run_id, tracking_uri, trust=trust)

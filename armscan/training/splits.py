@@ -14,6 +14,7 @@ from armscan.volumes import Dataset, LabelVolume, load_phantoms, open_dataset
 from armscan.volumes.dataset import SPLITS, copies_among
 from armscan.volumes.phantom import VERSIONS
 from armscan.volumes.phantom.generate import PHANTOM_NAME
+from armscan.volumes.volume import palm_notes
 
 # Phantoms of different parts never have the same seed.
 VALIDATION_FIRST_SEED, TEST_FIRST_SEED = 1_000_000, 2_000_000
@@ -87,16 +88,11 @@ class Split:
         return "; ".join(of_parts)
 
     @property
-    def orientation_note(self) -> str | None:
-        """A note if there are phantoms, and volumes whose palm is on the other side; None if they agree."""
+    def palm_notes(self) -> list[str]:
+        """Notes on volumes whose palm is on the other side than in the phantoms beside them."""
         volumes = {name: volume for of_part in self.parts.values() for name, volume in of_part.items()}
-        own = [name for name in volumes if not PHANTOM_NAME.fullmatch(name)]
-        # Only beside phantoms: all voxels are read.
-        turned = [name for name in own if len(own) < len(volumes) and not volumes[name].has_palm_at_high_z]
-        if not turned:
-            return None
-        shown = few(turned, N_NAMED)
-        return f"the palm is at low z in {shown}, in phantoms at high z; orientation in the manifest flips axes"
+        own = {name: volume for name, volume in volumes.items() if not PHANTOM_NAME.fullmatch(name)}
+        return palm_notes(own) if len(own) < len(volumes) else []
 
     def fingerprints(self) -> Fingerprints:
         """Return a checksum of each volume's contents, by part and name."""

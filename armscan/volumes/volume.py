@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Self
@@ -10,7 +11,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from armscan.errors import InvalidValueError, VolumeError, listed, printable
+from armscan.errors import InvalidValueError, VolumeError, few, listed, printable
 from armscan.utils.arrays import FloatArray
 from armscan.utils.validation import check_int, check_numbers
 from armscan.volumes.labelmap import ALLOWED_LABELS, LABEL_NAMES, LANDMARK_LABELS, TISSUE_LABELS, check_whole, shown
@@ -265,3 +266,10 @@ def _checked_direction(direction: FloatArray, name: str) -> FloatArray:
         raise VolumeError(f"{name}: direction is {received}, but its 3 columns must be unit vectors at right angles")
     checked.flags.writeable = False
     return checked
+
+
+def palm_notes(volumes: Mapping[str, LabelVolume]) -> list[str]:
+    """Return a sentence on volumes, by name, whose palm is on the other side than in phantoms; reads all voxels."""
+    turned = [name for name, volume in volumes.items() if not volume.has_palm_at_high_z]
+    advice = "in phantoms at high z; orientation in the manifest flips axes"
+    return [f"the palm is at low z in {few(turned)}, {advice}"] if turned else []

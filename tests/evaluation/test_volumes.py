@@ -2,12 +2,11 @@
 
 import json
 import shutil
-from types import SimpleNamespace
 
 import pytest
 import yaml
 
-from armscan.evaluation.volumes import file_name, orientation_notes
+from armscan.evaluation.volumes import file_name
 from tests.support.tracked_runs import GUESSER, ON_FILES, tracked, written
 
 
@@ -96,13 +95,6 @@ def test_another_volume_of_a_subject_of_the_training_is_known(evaluate, tmp_path
     code, printed, errors = evaluate(run_id, "--trust", "--data=other", "--episodes=2")
     assert (code, errors) == (0, "")
     assert "note: the agent was trained on other volumes of the same subjects as: again.nii.gz\n" in printed
-
-
-def test_volumes_whose_palm_is_on_the_other_side_than_in_phantoms_are_noted():
-    usual, turned = (SimpleNamespace(has_palm_at_high_z=is_high) for is_high in (True, False))
-    assert orientation_notes({"test": {"a": usual}}) == []
-    (note,) = orientation_notes({"test": {"a": usual, "b": turned}, "others": {"c": turned}})
-    assert note.startswith("the palm is at low z in b, c, in phantoms at high z")
 
 
 def test_file_names_of_long_names_are_short_and_stay_apart():

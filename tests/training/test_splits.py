@@ -43,9 +43,9 @@ def test_wrists_whose_palm_is_on_the_other_side_than_in_phantoms_beside_them_are
     alone = nifti_data(folder())
     for is_high, noted in ((True, False), (False, True)):
         monkeypatch.setattr(LabelVolume, "has_palm_at_high_z", is_high)
-        assert bool(mixed.orientation_note) == noted
-        assert alone.orientation_note is None
-    assert "the palm is at low z in a.nrrd, b.nrrd, c.nrrd" in mixed.orientation_note
+        assert bool(mixed.palm_notes) == noted
+        assert alone.palm_notes == []
+    assert mixed.palm_notes[0].startswith("the palm is at low z in a.nrrd, b.nrrd, c.nrrd, d.nrrd and 2 more, in phan")
 
 
 @pytest.mark.parametrize(
