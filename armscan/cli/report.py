@@ -57,9 +57,9 @@ def report(study: str | None, runs: str | None, out: Path | None, watch: bool, s
             raise InvalidValueError(f"--out is {str(out)!r}, but {nearest} is not a folder: name one, or a new one")
     if runs is not None:
         # Deferred: command-line errors are reported before these are loaded.
-        from armscan.reports.runs import compare_runs
+        from armscan.reports.runs import write_runs_report
 
-        file = compare_runs(runs, tracking, out)
+        file = write_runs_report(runs, tracking, out)
     elif study is not None:
         write = _reporter_on_study(study, storage, out)
         if watch:

@@ -18,7 +18,7 @@ from armscan.training.metric_display import leading_among
 TESTED = f"{TEST_METRICS}/"
 
 
-def best_of(runs: Sequence[Run]) -> Run | None:
+def best_job(runs: Sequence[Run]) -> Run | None:
     """Return the run with the highest leading on-plane rate on its test volumes.
 
     None if no run was evaluated, or their leading rates are within different limits.
@@ -41,7 +41,7 @@ def log_best(store: TrackingStore, parent_id: str, jobs: Sequence[Run]) -> None:
         parent_id: MLflow run ID of the grid.
         jobs: Runs of its jobs.
     """
-    if (best := best_of(jobs)) is None:
+    if (best := best_job(jobs)) is None:
         return
     limits = [Param(name, value) for name, value in best.data.params.items() if name == ON_PLANE_KEY]
     if not have_same_task(job.data.params for job in jobs):

@@ -85,7 +85,7 @@ def write_comparison(groups: Sequence[Group], left_out: Sequence[TrackedTraining
     }
     reached = [final_metrics(group) for group in groups]
     pairs = compare_groups(groups)
-    final = final_table(groups, reached)
+    final = groups_table(groups, reached)
     labels = {group.label for group in groups}
     baselines = {name: each for name, each in final.results.items() if name not in labels}
     tables = all_numbers(groups, curves, reached, pairs, baselines)
@@ -178,7 +178,7 @@ def _final(
     yield f"<p>{HOW_FINAL}</p>{final.html()}{drawn}"
 
 
-def final_table(groups: Sequence[Group], reached: Sequence[MetricEstimates | None]) -> ResultTable:
+def groups_table(groups: Sequence[Group], reached: Sequence[MetricEstimates | None]) -> ResultTable:
     """Return the table of the groups' results, and of the baselines."""
     nothing = MetricEstimates.of_metrics({})
     metrics = {group.label: each or nothing for group, each in zip(groups, reached, strict=True)}

@@ -18,7 +18,7 @@ REPORTS = Path("reports")
 MAX_NAME_CHARS, SUM_CHARS = 60, 12
 
 
-def compare_runs(text: str, uri: str, out: Path | None) -> Path:
+def write_runs_report(text: str, uri: str, out: Path | None) -> Path:
     """Write a report that compares runs.
 
     Args:

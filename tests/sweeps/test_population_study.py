@@ -12,7 +12,7 @@ from collections import Counter
 
 import pytest
 
-from armscan.sweeps.tasks.attempt import trial_folder
+from armscan.sweeps.tasks.folders import trial_folder
 from armscan.training import load_checkpoint
 from armscan.utils.processes import ProcessInfo
 from tests.support.processes import start_run

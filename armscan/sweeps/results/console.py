@@ -26,7 +26,7 @@ from armscan.sweeps.study.candidates import NOTHING_SEARCHED
 from armscan.sweeps.study.final_eval import FinalEvaluation
 from armscan.sweeps.study.phase import OpenedStudy
 from armscan.sweeps.study.study import best_trials
-from armscan.sweeps.tasks.attempt import seed_folder, trial_folder
+from armscan.sweeps.tasks.folders import seed_folder, trial_folder
 from armscan.training.metric_display import title_of, value_text
 from armscan.utils.console import WHOLE_CHARS, print_sentence, wide_console
 from armscan.utils.run_files import RUN_FILE

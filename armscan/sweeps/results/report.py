@@ -35,7 +35,7 @@ from armscan.sweeps.storage.attribute_names import (
 from armscan.sweeps.study.candidates import name_of, settings_of
 from armscan.sweeps.study.final_eval import FinalEvaluation
 from armscan.sweeps.study.study import best_trials
-from armscan.sweeps.tasks.attempt import seed_folders
+from armscan.sweeps.tasks.folders import seed_folders
 from armscan.training.metric_display import title_of, value_text
 from armscan.utils.run_files import ID_CHARS, VIDEO_FILE
 from armscan.utils.text import MISSING, counted

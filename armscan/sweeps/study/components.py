@@ -27,7 +27,7 @@ from armscan.sweeps.study.arguments import fixed_by
 from armscan.sweeps.study.samplers import CmaEsSampler
 from armscan.sweeps.study.settings import StudySettings
 from armscan.sweeps.study.terminators import Terminator
-from armscan.sweeps.tasks.attempt import Task
+from armscan.sweeps.tasks.task import Task
 from armscan.utils.files import nearest_existing
 from armscan.utils.validation import missing_members
 

@@ -32,7 +32,7 @@ from armscan.sweeps.study.settings import StudySettings
 from armscan.sweeps.study.study import fixed_config, make_study, name_objectives
 from armscan.sweeps.study.terminators import Terminator
 from armscan.sweeps.study.warm_start import values_of
-from armscan.sweeps.tasks.attempt import Task
+from armscan.sweeps.tasks.task import Task
 from armscan.tracking import TrackingStore, code_state, open_store, run_of_study
 from armscan.tracking.tags import OVERRIDES_TAG, STORAGE_TAG, STUDY_TAG, TRIAL_TAG
 from armscan.utils.console import print_sentence

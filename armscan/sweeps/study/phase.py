@@ -18,7 +18,8 @@ from armscan.sweeps.space.space import Space
 from armscan.sweeps.storage.attribute_names import FINALIST, RETRY_OF, RUN, SCHEDULE
 from armscan.sweeps.study.final_eval import FinalEvaluation
 from armscan.sweeps.study.settings import StudySettings
-from armscan.sweeps.tasks.attempt import Attempt, seed_folders, trial_folder
+from armscan.sweeps.tasks.attempt import Attempt
+from armscan.sweeps.tasks.folders import seed_folders, trial_folder
 from armscan.tracking import TrackingStore, fail_dead_runs
 from armscan.tracking.tags import FAILURE_TAG, STORAGE_TAG, STUDY_TAG, TRIAL_TAG
 from armscan.utils.run_files import LAST_CHECKPOINT

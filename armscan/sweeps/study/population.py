@@ -14,7 +14,7 @@ from armscan.errors import InvalidValueError, few, listed
 from armscan.sweeps.scheduling.population import Population, PopulationSampler
 from armscan.sweeps.study.components import make, make_as
 from armscan.sweeps.study.settings import NO_PRUNER, StudySettings
-from armscan.sweeps.tasks.attempt import Task
+from armscan.sweeps.tasks.task import Task
 from armscan.sweeps.tasks.training import TrainingTask
 from armscan.utils.validation import check_int
 

@@ -1,4 +1,4 @@
-"""Tasks of trials, and an attempt at one: its configuration, reports, MLflow run and folder."""
+"""An attempt at a trial: its configuration, reports, MLflow run and folder."""
 
 from __future__ import annotations
 
@@ -6,9 +6,8 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
-from numbers import Real
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import optuna
@@ -16,7 +15,6 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from optuna.trial import Trial
 
-from armscan.errors import InvalidValueError, listed
 from armscan.stats.bootstrap import interquartile_mean, mean
 from armscan.sweeps.scheduling.claim import PendingWrites
 from armscan.sweeps.scheduling.state import retried_by
@@ -32,12 +30,12 @@ from armscan.sweeps.storage.attribute_names import (
     SUBJECTS,
 )
 from armscan.sweeps.storage.reports import reports_of, store_report
+from armscan.sweeps.tasks.folders import trial_folder
 from armscan.tracking import TrackedRun
 from armscan.training import Evaluation, Split
 from armscan.utils.files import sha256
-from armscan.utils.validation import check_float
 
-TRIAL_DIGITS, N_SUM_CHARS = 4, 12
+N_SUM_CHARS = 12
 # Why a run has ended whose worker was taken for dead.
 TAKEN_OVER = "taken over by another worker"
 
@@ -209,58 +207,6 @@ def over_seeds(metric: str, values: Sequence[float]) -> float:
     return float((mean if metric == "solved" else interquartile_mean)(np.array(values)))
 
 
-class Task(Protocol):
-    """Work of the trials of a study; `study.task._target_` names its class, which needs no arguments."""
-
-    def metrics(self, config: DictConfig) -> tuple[str, ...]:
-        """Return the names of the metrics that `run` returns in this configuration, which may be objectives."""
-
-    @property
-    def final_metric(self) -> str:
-        """Name of the leading metric that `evaluate` returns."""
-
-    def check(self, config: DictConfig) -> None:
-        """Check that a trial with this configuration could begin; called for many of them before the first trial.
-
-        Raises:
-            ArmscanError: If it could not.
-        """
-
-    def run(self, attempt: Attempt) -> dict[str, float]:
-        """Run a trial, or resume one, and return its metrics.
-
-        Raises:
-            optuna.TrialPruned: If the trial is pruned.
-        """
-
-    def validate(self, attempt: Attempt) -> dict[str, float]:
-        """Run a candidate with one seed, and return the metrics that `run` returns, on the validation volumes.
-
-        Candidates are compared by these metrics, so they must not be the best of several validations.
-        """
-
-    def evaluate(self, attempt: Attempt) -> dict[str, float]:
-        """Run the chosen configuration, or the control, with one other seed, and return metrics on the test volumes.
-
-        Their names begin with `test/`.
-        """
-
-
-def trial_folder(study_folder: Path, number: int) -> Path:
-    """Return the folder of a trial."""
-    return study_folder / "trials" / f"{number:0{TRIAL_DIGITS}}"
-
-
-def seed_folder(folder: Path, seed: int) -> Path:
-    """Return the folder of a training, in that of its trial."""
-    return folder / f"seed_{seed}"
-
-
-def seed_folders(folder: Path) -> list[Path]:
-    """Return the folders of a trial's trainings."""
-    return sorted(folder.glob("seed_*"))
-
-
 def config_sha256(config: Mapping[str, Any]) -> str:
     """Return the SHA-256 of a configuration's values except the seed, by which the runs of one trial differ."""
     return _sha256({key: value for key, value in config.items() if key != "seed"})
@@ -285,17 +231,3 @@ def volume_sums(split: Split) -> dict[str, str]:
 def _volumes(data: str) -> Split:
     volumes: Split = instantiate(OmegaConf.create(data), _convert_="object")
     return volumes
-
-
-def check_metrics(metrics: Any, objectives: Sequence[str]) -> dict[str, float]:
-    """Return the metrics of a task by name, checked: objectives must be finite."""
-    if not isinstance(metrics, Mapping):
-        raise InvalidValueError(f"the task has returned {metrics!r}, but it must be metrics by their names")
-    if missing := [name for name in objectives if name not in metrics]:
-        raise InvalidValueError(f"the task has not returned {missing[0]}, but only {listed(list(metrics))}")
-    for name, value in metrics.items():
-        if name in objectives:
-            check_float(f"what the task has returned as {name}", value)
-        elif not isinstance(value, Real):
-            raise InvalidValueError(f"what the task has returned as {name} is {value!r}, but it must be a number")
-    return {str(name): float(value) for name, value in metrics.items()}

@@ -14,7 +14,7 @@ from armscan.sweeps.storage.attribute_names import METRICS, RETRY_OF, RUN
 from armscan.sweeps.storage.attributes import SELECTION_SUFFIX
 from armscan.sweeps.study.dashboard import named_as_of_runs, note_run
 from armscan.sweeps.study.phase import Phase
-from armscan.sweeps.tasks.attempt import trial_folder
+from armscan.sweeps.tasks.folders import trial_folder
 from armscan.tracking import TrackedRun, run_of_study
 from armscan.tracking.sync import PROCESS_DIED
 from armscan.tracking.tags import (

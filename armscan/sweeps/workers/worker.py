@@ -27,7 +27,9 @@ from armscan.sweeps.study.components import make, read_settings
 from armscan.sweeps.study.dashboard import note_run, show_picture, shown_metrics, table_of_seeds
 from armscan.sweeps.study.open import open_for_work
 from armscan.sweeps.study.phase import Phase
-from armscan.sweeps.tasks.attempt import TAKEN_OVER, Attempt, check_metrics, config_sha256, trial_folder
+from armscan.sweeps.tasks.attempt import TAKEN_OVER, Attempt, config_sha256
+from armscan.sweeps.tasks.folders import trial_folder
+from armscan.sweeps.tasks.task import check_metrics
 from armscan.sweeps.workers.heartbeat import Heartbeat
 from armscan.sweeps.workers.trial_run import close_requeued, end_run, open_run
 from armscan.tracking import TrackedRun

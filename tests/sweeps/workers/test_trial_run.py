@@ -4,7 +4,7 @@ from optuna.trial import TrialState
 
 from armscan.sweeps.scheduling.claim import PendingWrites
 from armscan.sweeps.storage.attribute_names import METRICS, RUN
-from armscan.sweeps.tasks.attempt import trial_folder
+from armscan.sweeps.tasks.folders import trial_folder
 from armscan.sweeps.workers.trial_run import end_runs_left_open, open_run
 from armscan.tracking.sync import PROCESS_DIED
 from armscan.tracking.tags import FAILURE_TAG, PRUNED_TAG

@@ -26,7 +26,7 @@ from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.phase import Phase
 from armscan.sweeps.study.pruners import ParetoPruner
 from armscan.sweeps.study.study import best_trials
-from armscan.sweeps.tasks.attempt import trial_folder
+from armscan.sweeps.tasks.folders import trial_folder
 from armscan.sweeps.workers import heartbeat, worker
 from armscan.sweeps.workers.heartbeat import Heartbeat
 from armscan.sweeps.workers.worker import Worker
