@@ -142,7 +142,7 @@ def evaluate(
     else:
         prepared = prepare_agent(source, data, phantoms, check=lambda groups: _check_episodes(n_episodes, groups))
         experiment = {} if tracking_experiment is None else {"experiment": tracking_experiment}
-        _evaluate(prepared, default_tracking() | {"uri": tracking} | experiment, n_episodes, seed, changes, out)
+        _evaluate(prepared, default_tracking() | {"uri": tracking} | experiment, n_episodes, seed, out)
 
 
 def _record(prepared: PreparedAgent, n_episodes: int, seed: int, out: Path | None) -> None:
@@ -159,21 +159,20 @@ def _evaluate(
     store: Mapping[str, Any],
     n_episodes: int,
     seed: int,
-    changes: Mapping[str, Any],
     out: Path | None,
 ) -> None:
     """Evaluate an agent, track its metrics, and print them."""
     from armscan.evaluation import report_tables
-    from armscan.evaluation.track import changed_rules, evaluate_and_track, notes_on
+    from armscan.evaluation.track import evaluate_and_track, notes_on, notes_on_rules
     from armscan.experiment.console import print_result_table, print_where_to_look
 
-    report, file = evaluate_and_track(prepared, store, n_episodes=n_episodes, seed=seed, changes=changes, out=out)
+    report, file = evaluate_and_track(prepared, store, n_episodes=n_episodes, seed=seed, out=out)
     console = wide_console()
     for part in report_tables(report, console.width):
         console.print(part)
     tables = report.tables()
     for label, table in tables.items():
-        notes = [*changed_rules(changes), *notes_on(prepared, report, label)]
+        notes = [*notes_on_rules(prepared.source), *notes_on(prepared, report, label)]
         print_result_table(label, table, notes, how=label == [*tables][-1], of=label)
     print_where_to_look(Path.cwd(), store["uri"], files=(str(file),))
 

@@ -14,6 +14,7 @@ from armscan.config.compose import compose
 from armscan.config.defaults import CHANGES, to_plain
 from armscan.config.own_code import changed_modules, own_code
 from armscan.errors import CheckpointError, InvalidValueError, few
+from armscan.evaluation.report import assigned
 from armscan.experiment.build import check_keys, check_sections
 from armscan.tracking.lookup import FoundRun, load_agent_run
 from armscan.tracking.tags import DOMAIN_TAG, OWN_CODE_TAG, WORKING_FOLDER_TAG
@@ -36,6 +37,7 @@ class EvaluatedAgent:
         n_env_steps: Environment steps at the end of its best epoch, which the weights are from. Default: 0.
         domain: Training domain; None if its run has none.
         volumes: Fingerprints of its run's volumes; None if the run has none.
+        changes: Changed rules, by the names in `CHANGES`. Default: none.
     """
 
     name: str
@@ -45,6 +47,12 @@ class EvaluatedAgent:
     n_env_steps: int = 0
     domain: TrainingDomain | None = None
     volumes: Fingerprints | None = field(default=None, repr=False)
+    changes: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def changed_rules(self) -> list[str]:
+        """Changed rules as they are shown, such as `max_steps=3`."""
+        return assigned(self.changes)
 
     @property
     def code_note(self) -> str | None:
@@ -74,7 +82,7 @@ def agent_of_run(tracking: str, run_id: str, changes: Mapping[str, Any], *, trus
         # Older runs of learners have them in the checkpoint only.
         volumes = run.volumes(Path(folder)) or facts.get("volumes") or None
     domain = TrainingDomain.from_json(run.tags[DOMAIN_TAG]) if DOMAIN_TAG in run.tags else None
-    return EvaluatedAgent(run.name, config, run, weights, _n_env_steps(facts, run.run_id), domain, volumes)
+    return EvaluatedAgent(run.name, config, run, weights, _n_env_steps(facts, run.run_id), domain, volumes, changes)
 
 
 def _n_env_steps(facts: Mapping[str, Any], run_id: str) -> int:
@@ -101,7 +109,7 @@ def agent_of_overrides(overrides: Sequence[str], folder: str | None, changes: Ma
         config.data.path = folder
     OmegaConf.resolve(config)
     agents = [override.partition("=")[2] for override in overrides if override.startswith("agent=")]
-    return EvaluatedAgent(agents[-1], changed(config, changes))
+    return EvaluatedAgent(agents[-1], changed(config, changes), changes=changes)
 
 
 def changed(config: DictConfig, changes: Mapping[str, Any]) -> DictConfig:

@@ -12,7 +12,7 @@ from typing import Any
 from armscan.config.defaults import to_plain
 from armscan.errors import InvalidValueError
 from armscan.evaluation.agent_source import EvaluatedAgent
-from armscan.evaluation.report import EvaluationReport, assigned
+from armscan.evaluation.report import EvaluationReport
 from armscan.evaluation.runner import PreparedAgent
 from armscan.evaluation.volumes import check_out, data_name, file_name
 from armscan.experiment.build import on_plane_of
@@ -33,7 +33,6 @@ def evaluate_and_track(
     *,
     n_episodes: int,
     seed: int,
-    changes: Mapping[str, Any],
     out: Path | None,
 ) -> tuple[EvaluationReport, Path]:
     """Evaluate an agent, write the report as JSON, and track it.
@@ -43,7 +42,6 @@ def evaluate_and_track(
         tracking: Section `tracking` of the configuration, used for an agent without a run.
         n_episodes: Number of episodes for each group of volumes.
         seed: Seed of the evaluation, which the seeds of its episodes follow from.
-        changes: Rules of the episodes that differ from the agent's configuration.
         out: JSON file to write; None: a new one in `evaluations`.
 
     Returns:
@@ -64,13 +62,13 @@ def evaluate_and_track(
         "data": prepared.data or data,
         "episodes_a_split": n_episodes,
         "seed": seed,
-        "changes": dict(changes),
+        "changes": dict(source.changes),
         "notes": list(prepared.notes),
     }
     with TrackedRun.start(
         store,
         experiment_id,
-        name=", ".join([f"evaluation: {source.name} on {data}", *assigned(changes)]),
+        name=", ".join([f"evaluation: {source.name} on {data}", *source.changed_rules]),
         config={**to_plain(source.config), "evaluation": {**facts, "on_plane": [list(each) for each in limits]}},
         tags={EVALUATED_TAG: of},
         folder=FOLDER,
@@ -92,7 +90,7 @@ def evaluate_and_track(
         text = json.dumps(report.to_dict(), indent=1, allow_nan=False)
         atomic_write(file, text, follow_link=True)
         shown = own.with_suffix(".html")
-        notes = [*changed_rules(changes), *prepared.notes]
+        notes = [*notes_on_rules(source), *prepared.notes]
         sections, described = [], [f"Note: {note}." for note in notes]
         for label, table in report.tables().items():
             of_label = [f"Note: {note}." for note in notes_on(prepared, report, label)]
@@ -111,9 +109,9 @@ def notes_on(prepared: PreparedAgent, report: EvaluationReport, label: str) -> l
     return [*report.notes(label), *([used] if label in prepared.own else [])]
 
 
-def changed_rules(changes: Mapping[str, Any]) -> list[str]:
+def notes_on_rules(source: EvaluatedAgent) -> list[str]:
     """Return the notes on rules that differ from the agent's configuration: one, or none if no rule was changed."""
-    return [f"changed for this evaluation: {', '.join(assigned(changes))}"] if changes else []
+    return [f"changed for this evaluation: {', '.join(source.changed_rules)}"] if source.changes else []
 
 
 def _store_of(source: EvaluatedAgent, tracking: Mapping[str, Any]) -> tuple[TrackingStore, str]:

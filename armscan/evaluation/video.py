@@ -34,7 +34,7 @@ def record_video(prepared: PreparedAgent, *, n_episodes: int, seed: int, out: Pa
     check_out(folder / "video", folder, "video")
     source = prepared.source
     which = [source.run.run_id[:ID_CHARS]] if source.run else []
-    name = file_name(source.name, data_name(prepared.data), *which, f"seed{seed}")
+    name = file_name(source.name, data_name(prepared.data), *which, "-".join([f"seed{seed}", *source.changed_rules]))
     files = [folder / f"{name}{suffix}" for suffix in SUFFIXES]
     with tempfile.TemporaryDirectory() as made_in:
         made = [Path(made_in) / f"video{suffix}" for suffix in SUFFIXES]

@@ -59,7 +59,7 @@ def test_video_is_of_the_episodes_of_an_evaluation_frame_by_frame_in_both_files(
     n_steps = [each["n_steps"] for each in episodes]
     assert [int(steps) for *_, steps, _ in told] == n_steps
     assert [float(mm) for *_, mm in told] == [round(each["distance_mm"], 1) for each in episodes]
-    name = f"videos/tiny-configured-volumes-{run_id[:8]}-seed4"
+    name = f"videos/tiny-configured-volumes-{run_id[:8]}-seed4-max_steps-3"
     assert printed.endswith(f"look at   {name}.gif\nlook at   {name}.mp4\n")
     frames = gif_frames(tmp_path / f"{name}.gif")
     durations = [ms for steps in n_steps for ms in [*steps * [600], 2400]]
@@ -93,7 +93,9 @@ def test_baseline_is_recorded_without_a_store(record, tmp_path):
     assert [volume for _, volume, *_ in EPISODE.findall(printed)] == [
         *("phantom-3000000", "phantom-3000001", "phantom-3000000")
     ]
-    assert {file.name for file in (tmp_path / "videos").iterdir()} == {"sac-phantom-seed0.gif", "sac-phantom-seed0.mp4"}
+    assert {file.name for file in (tmp_path / "videos").iterdir()} == {
+        f"sac-phantom-seed0-max_steps-2{suffix}" for suffix in (".gif", ".mp4")
+    }
     assert not (tmp_path / "mlruns.db").exists()
 
 
