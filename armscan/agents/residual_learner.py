@@ -108,6 +108,15 @@ class ResidualLearner(PlaneFinderLearner):
         """Return how the gradient steps of SAC are computed."""
         return f"{self._sac.update_note}, after pretraining"
 
+    def weights_note(self, n_env_steps: int) -> str | None:
+        """Return a note if the weights after so many environment steps are from before SAC has learned; else None."""
+        if n_env_steps > self._pretraining_env_steps:
+            return None
+        return (
+            f"the best weights are those after {n_env_steps:,} steps, from the pretraining: the planes are the plane "
+            "finder's, which SAC has not corrected"
+        )
+
     def learn(self, n_env_steps: int) -> dict[str, float]:
         """Learn for one epoch, cut short at the end of the pretraining; see `Learner.learn`."""
         if (n_left := self._pretraining_env_steps - super().n_env_steps) > 0:

@@ -117,7 +117,8 @@ def draw_plane(
         _place(picture, draw, REWARD_BOX, history.title, panel)
         goal_at = REWARD_BOX[2], REWARD_BOX[1] - TITLE_GAP
         draw.text(goal_at, f"goal: above {history.threshold:g}", fill=TEXT_COLOUR, font=font(14), anchor="rs")
-    _write_facts(draw, volume, plane, view, reference, caption)
+    is_moved = transform is not None and transform != RigidTransform()
+    _write_facts(draw, volume, plane, view, is_moved=is_moved, reference=reference, caption=caption)
     _write_legend(draw, reference)
     return np.asarray(picture)
 
@@ -159,6 +160,8 @@ def _write_facts(
     volume: LabelVolume,
     plane: ManipulatorAction,
     view: View,
+    *,
+    is_moved: bool,
     reference: ReferencePlane | None,
     caption: str,
 ) -> None:
@@ -170,7 +173,7 @@ def _write_facts(
     lines = [
         volume.name,
         f"clusters: bones {bones}, tendons {tendons}, artery {artery}",
-        f"rz {rz:.1f}°, rx {rx:.1f}°",
+        f"{'in the moved volume: ' if is_moved else ''}rz {rz:.1f}°, rx {rx:.1f}°",
         f"tx {tx:.1f} mm, ty {ty:.1f} mm",
     ]
     if reference is not None:

@@ -45,11 +45,6 @@ EVALUATED = "/success_rate"
 # Of the metrics of a single volume in an evaluation.
 VOLUME_PREFIX = "volume/"
 NAMES = {metric_prefix(name): name for name in (TEST, TRAINING)} | {"validation": LAST_VALIDATION}
-MORE_HELP = "more subjects would help"
-WHAT_HELPS = (
-    f"{MORE_HELP}: data.n_validation and data.n_test with phantoms; data=mixed or cross-validation "
-    "(data.folds=leave_one_out) with a folder"
-)
 
 
 @dataclass(frozen=True)
@@ -61,12 +56,14 @@ class RunResult:
         baselines: Episodes of the baselines on the test volumes, by their names.
         validation: Validation of the best epoch; None for an agent that does not learn.
         own_baseline: Name of the baseline that equals the agent. Default: None, no baseline does.
+        weights_note: Note on the weights, if the agent has one. Default: None.
     """
 
     evaluations: Mapping[str, Evaluation]
     baselines: Mapping[str, Evaluation]
     validation: Evaluation | None = None
     own_baseline: str | None = None
+    weights_note: str | None = None
 
     @classmethod
     def of(cls, setup: RunSetup, result: TrainingResult | None) -> RunResult:
@@ -85,7 +82,11 @@ class RunResult:
         }
         baselines = evaluate_baselines(setup.test_env, n_episodes=n_episodes, seed=TEST_VOLUMES_SEED, on_plane=on_plane)
         own = RANDOM if isinstance(agent, RandomAgent) else None
-        return cls(evaluations, baselines, result.best.evaluation if result else None, own)
+        if result is None:
+            return cls(evaluations, baselines, own_baseline=own)
+        note_on = getattr(agent, "weights_note", None)
+        note = None if note_on is None else note_on(result.best.n_env_steps)
+        return cls(evaluations, baselines, result.best.evaluation, own, note)
 
     @cached_property
     def figures(self) -> dict[str, MetricEstimates]:
@@ -124,8 +125,9 @@ class RunResult:
         return {part: [f"{group}/{name}" for name in names] for part, group in groups.items()}
 
     def notes(self) -> list[str]:
-        """Return the notes on the volumes; see `volume_notes`."""
-        return volume_notes(self.figures[TEST], self.figures.get(VALIDATION))
+        """Return the note on the weights, if there is one, and those on the volumes; see `volume_notes`."""
+        on_weights = [self.weights_note] if self.weights_note else []
+        return [*on_weights, *volume_notes(self.figures[TEST], self.figures.get(VALIDATION))]
 
     def write(self, folder: Path, *, title: str) -> None:
         """Write all episodes, and a page with the table, to the folder of the run."""
@@ -185,29 +187,29 @@ def volume_notes(test: MetricEstimates, validation: MetricEstimates | None = Non
         test: Metrics on the test volumes.
         validation: Metrics on the validation volumes. Default: None, not validated.
     """
+    notes = few_subjects({"test ": test} | ({"validation ": validation} if validation is not None else {}))
     if validation is not None:
         leading = test.on_plane[0]
         here, there = (each.estimate(leading.metric) for each in (test, validation))
         if here.low > there.high or there.low > here.high:
             known, new = (formatted(PERCENT, each.value) for each in (there, here))
-            return [
-                f"{leading.title}: {known} on the validation and {new} on the test volumes, and "
-                "the intervals do not overlap: volumes differ more than episodes do, and other wrists may lie anywhere "
-                f"between or outside; {WHAT_HELPS}"
-            ]
-    return few_subjects({"test ": test} | ({"validation ": validation} if validation is not None else {}), WHAT_HELPS)
+            notes.append(
+                f"{leading.title}: {known} on the validation and {new} on the test volumes, and the intervals do not "
+                "overlap: volumes differ more than episodes do, and other wrists may lie anywhere between or outside"
+            )
+    return notes
 
 
-def few_subjects(figures: Mapping[str, MetricEstimates], helps: str = MORE_HELP) -> list[str]:
+def few_subjects(figures: Mapping[str, MetricEstimates]) -> list[str]:
     """Return a note if intervals come from too few subjects, as far as their number is known.
 
     Args:
         figures: Metrics by the word that describes the subjects, which ends with a blank, or is empty.
-        helps: What helps. Default: more subjects.
     """
     few = [
         counted(each.n_subjects, f"{of}subject") for of, each in figures.items() if 0 < each.n_subjects < MIN_SUBJECTS
     ]
     if not few:
         return []
-    return [f"{' and '.join(few)}, fewer than {MIN_SUBJECTS}: the intervals are too narrow for other subjects; {helps}"]
+    too_narrow = "the intervals are too narrow for other subjects; more subjects would help"
+    return [f"{' and '.join(few)}, fewer than {MIN_SUBJECTS}: {too_narrow}"]

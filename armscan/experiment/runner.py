@@ -19,6 +19,7 @@ from armscan.experiment.job import Invocation
 from armscan.experiment.provenance import start_tracking
 from armscan.experiment.results import RunResult
 from armscan.tracking import TrackedRun, draw_learning_curve
+from armscan.tracking.tags import BEST_ENV_STEP
 from armscan.tracking.view import artifact_address
 from armscan.training import (
     VALIDATION,
@@ -233,7 +234,7 @@ def _log_result(tracked: TrackedRun, result: TrainingResult | None, reached: Run
         if name != VALIDATION:
             tracked.log_metrics(figures, n_env_steps=result.best.n_env_steps if result else 0)
     if result:
-        tracked.log_metrics({"best_env_step": result.best.n_env_steps}, n_env_steps=result.reports[-1].n_env_steps)
+        tracked.log_metrics({BEST_ENV_STEP: result.best.n_env_steps}, n_env_steps=result.reports[-1].n_env_steps)
         tracked.log_model(reached.model_metrics(), n_env_steps=result.best.n_env_steps)
     curve = f"\n\n![learning curve]({artifact_address(tracked.run_id, LEARNING_CURVE_FILE)})" if result else ""
     tracked.set_description(reached.markdown() + curve)

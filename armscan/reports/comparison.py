@@ -58,7 +58,7 @@ HOW_BETTER = (
 
 # With more groups, the pairwise comparison is folded.
 MANY_PAIRS = 12
-NO_BEST = "No best group: the groups were judged in different tasks, or on different test volumes."
+NO_BEST = "No best group: the groups were judged {}."
 # With more groups, nobody can tell the bands apart.
 MAX_DETAILED = 24
 
@@ -187,8 +187,9 @@ def groups_table(groups: Sequence[Group], reached: Sequence[MetricEstimates | No
     baselines = dict(zip(labels, baseline_metrics(evaluated), strict=True))
     randoms = {label: each[RANDOM] for label, each in baselines.items() if RANDOM in each}
     # The best of several tasks is the easiest.
-    is_one_task = have_same_volumes(evaluated) and not differing_rules(evaluated)
-    best = headline(metrics, randoms) if is_one_task else NO_BEST if len(evaluated) > 1 else ""
+    differing = ["in different tasks"] if differing_rules(evaluated) else []
+    differing += [] if have_same_volumes(evaluated) else ["on different test volumes"]
+    best = headline(metrics, randoms) if not differing else NO_BEST.format(" and ".join(differing))
     return ResultTable(with_baselines(metrics, baselines), headline=best)
 
 

@@ -39,6 +39,7 @@ def _run_row(group: Group, training: TrackedTraining) -> Row:
         **_seed_and_fold(training),
         "status": training.status,
         "environment steps": "" if math.isnan(training.env_steps) else int(training.env_steps),
+        "weights after, steps": "" if math.isnan(training.best_env_steps) else int(training.best_env_steps),
         "training, s": "" if math.isnan(training.wall_s) else training.wall_s,
         "not kept": ", ".join(training.missing),
     }

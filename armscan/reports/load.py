@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,6 +21,7 @@ from armscan.tracking.histories import History, metric_histories
 from armscan.tracking.run import PRUNED
 from armscan.tracking.store import store_errors
 from armscan.tracking.tags import (
+    BEST_ENV_STEP,
     CHOICE,
     COMMIT_TAG,
     OVERRIDES_TAG,
@@ -85,6 +87,7 @@ class TrackedTraining:
         commit: Commit of the code, or the version of an installed package. Default: None, not known.
         volumes: Fingerprints of its volumes by split (training, validation, test) and name; None if it has kept none.
         video: Episode as an animated GIF; None if it has kept none.
+        best_env_steps: Environment steps at the end of the epoch whose weights it has kept. Default: NaN, not known.
     """
 
     run_id: str
@@ -102,6 +105,7 @@ class TrackedTraining:
     commit: str | None = None
     volumes: Fingerprints | None = field(repr=False)
     video: bytes | None = field(repr=False)
+    best_env_steps: float = math.nan
 
     @property
     def id(self) -> str:
@@ -203,6 +207,7 @@ def _training(run: Run, histories: Mapping[str, History], files: Mapping[str, by
         commit=tags.get(COMMIT_TAG, tags.get(VERSION_TAG)),
         volumes=_parsed(run, files, VOLUMES_FILE, lambda contents: fingerprints_in(contents, VOLUMES_FILE)),
         video=files.get(VIDEO_FILE),
+        best_env_steps=float(run.data.metrics.get(BEST_ENV_STEP, math.nan)),
     )
 
 

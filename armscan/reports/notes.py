@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import math
 from collections.abc import Iterator, Sequence
 
 from armscan.config.defaults import FOLDS
@@ -17,10 +18,12 @@ from armscan.training.headline import MIN_SUBJECTS
 from armscan.training.metrics import MetricEstimates
 from armscan.training.splits import PARTS
 from armscan.utils.run_files import ID_CHARS
+from armscan.utils.text import counted
 from armscan.volumes.phantom.generate import PHANTOM_NAME
 
 # From this number of seeds on, the intervals of final figures are nearly as wide as they should be.
 MANY_SEEDS = 5
+PRETRAINING = "agent.pretraining_env_steps"
 
 
 def notes_on(
@@ -44,6 +47,7 @@ def notes_on(
         *_on_folds(groups),
         *_on_seeds(groups),
         *_on_subjects(groups, reached),
+        *_on_pretraining(groups),
         *_on_unfinished(groups),
         *_on_missing(groups),
         *_on_curves(groups, curves),
@@ -108,6 +112,19 @@ def _on_subjects(groups: Sequence[Group], reached: Sequence[MetricEstimates | No
     if few := [number for number, n_subjects in tested if 0 < n_subjects < MIN_SUBJECTS]:
         what = f"fewer than {MIN_SUBJECTS} test subjects: the intervals are too narrow for other subjects"
         yield f"{_numbered(few, groups)}: {what}."
+
+
+def _on_pretraining(groups: Sequence[Group]) -> Iterator[str]:
+    for group in groups:
+        n_pretraining = group.trainings[0].params.get(PRETRAINING, "")
+        tested = [each for each in group.tested if not math.isnan(each.best_env_steps)]
+        if not n_pretraining.isdecimal() or not tested:
+            continue
+        if n_pretrained := sum(each.best_env_steps <= int(n_pretraining) for each in tested):
+            yield (
+                f"Group {group.number}: the best weights of {n_pretrained} of {counted(len(tested), 'run')} are from "
+                "the pretraining; their planes are the plane finder's, which SAC has not corrected."
+            )
 
 
 def _on_unfinished(groups: Sequence[Group]) -> Iterator[str]:

@@ -36,3 +36,5 @@ CONTINUED_TAG = "continued_by"
 STUDY_TAG, STORAGE_TAG, TRIAL_TAG, PRUNED_TAG = "study", "study.storage", "trial", "pruned"
 # Prefixes of metrics: of validations, and of what a study measures to select a configuration.
 VALIDATION_PREFIX, SELECTION_PREFIX = "validation/", "selection/"
+# Metric of a training: the environment steps after which its best weights were kept.
+BEST_ENV_STEP = "best_env_step"

@@ -56,6 +56,8 @@ def test_teaching_ends_with_its_steps_and_the_rest_is_for_sac(phantom):
     assert "update/critic_loss" in learner.learn(40)
     # Its random corrections are among them.
     assert learner.n_env_steps == N_TAUGHT + 40
+    assert "from the pretraining" in learner.weights_note(N_TAUGHT)
+    assert learner.weights_note(N_TAUGHT + 40) is None
 
 
 def test_pretraining_takes_its_own_steps_also_if_sac_collects_more_at_once(phantom):

@@ -8,7 +8,7 @@ from benchmarks.sweeps.bench.races import N_SEEDS, Choices, candidates_of, choic
 from benchmarks.sweeps.bench.ranking import REFERENCE, ranked, studies_of
 from benchmarks.sweeps.bench.replay import Rule, choose, search
 from benchmarks.sweeps.bench.seed_rules import fixed
-from benchmarks.sweeps.bench.surrogate import Surrogate, fit_of
+from benchmarks.sweeps.bench.surrogate import SELECTION_PART, Surrogate, fit_of
 from tests.benchmarks.conftest import synthetic_curves, true_log
 
 
@@ -44,7 +44,7 @@ def test_the_truth_is_the_mean_of_simulated_trainings(surrogate):
     tests = np.array([config.train(rng).test for _ in range(4000)])
     assert tests.mean() == pytest.approx(config.truth, abs=4 * tests.std() / np.sqrt(len(tests)))
     selections = np.array([config.train(rng).selection for _ in range(4000)])
-    assert selections.mean() == pytest.approx(config.selection_truth, abs=4 * selections.std() / np.sqrt(4000))
+    assert selections.mean() == pytest.approx(config.truth_of(SELECTION_PART), abs=4 * selections.std() / np.sqrt(4000))
     place = np.array([places_of(surrogate.space, surrogate.best()[0])])
     assert surrogate.truth(place) == pytest.approx(config.truth)
 

@@ -144,7 +144,10 @@ def test_draw_plane_without_an_episode_names_no_step_and_no_optimal_plane(phanto
     assert not [text for text in written if "step" in text or "optimal" in text or "from the p" in text[:10]]
     written.clear()
     draw_plane(phantom, plane, view, reference=ReferencePlane(plane, "former plane"))
-    assert {"former plane", "0.0 mm and 0.0°", "from the former plane"} <= set(written)
+    assert {"former plane", "0.0 mm and 0.0°", "from the former plane", "rz 3.0°, rx 0.0°"} <= set(written)
+    written.clear()
+    draw_plane(phantom, plane, view, transform=RigidTransform((5.0, 0.0)))
+    assert "in the moved volume: rz 3.0°, rx 0.0°" in written
 
 
 @pytest.mark.parametrize(

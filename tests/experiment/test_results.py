@@ -58,8 +58,9 @@ def test_validation_that_no_interval_shares_with_the_test_is_said_in_one_line():
         MetricEstimates.of(Evaluation([replace(each, distance_mm=mm, distance_deg=0.0) for each in made_episodes(0)]))
         for mm in (0.0, 50.0)
     )
-    (note,) = volume_notes(on_plane, off_plane)
-    assert "0% on the validation and 100% on the test volumes, and the intervals do not overlap" in note
+    few, apart = volume_notes(on_plane, off_plane)
+    assert few.startswith("4 test subjects and 4 validation subjects, fewer than 8")
+    assert "0% on the validation and 100% on the test volumes, and the intervals do not overlap" in apart
 
 
 def test_table_of_an_evaluation_names_the_volumes_of_each_figure():

@@ -26,6 +26,13 @@ def written(tmp_path):
     return write
 
 
+def test_group_whose_best_weights_are_from_the_pretraining_has_a_note(written, make_training):
+    params = {"agent.pretraining_env_steps": "100"}
+    page, _ = written(*(make_training(seed, params=params, best_env_steps=float(100 + seed)) for seed in range(3)))
+    assert "the best weights of 1 of 3 runs are from the pretraining" in page
+    assert "from the pretraining" not in written(make_training(best_env_steps=100.0))[0]
+
+
 def test_twenty_groups_have_a_report(written, make_training):
     page, rows = written(
         *(make_training(seed, params={"agent.lr": str(lr)}, mean_steps=lr) for lr in range(1, 21) for seed in range(2))

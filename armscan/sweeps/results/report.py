@@ -19,9 +19,9 @@ from armscan.sweeps.results.judgement import Judgement, judge
 from armscan.sweeps.results.notes import notes_on
 from armscan.sweeps.results.population_charts import population_charts
 from armscan.sweeps.results.selection import candidates_of, decision_section
-from armscan.sweeps.scheduling.state import StudyState, env_steps_of, is_feasible, was_retried
+from armscan.sweeps.scheduling.state import CONTROL, StudyState, env_steps_of, is_feasible, was_retried
 from armscan.sweeps.scheduling.termination import REASON
-from armscan.sweeps.space.parameter import overrides_of
+from armscan.sweeps.space.parameter import Value, overrides_of
 from armscan.sweeps.storage.attribute_names import (
     EPISODES,
     FINALIST,
@@ -78,7 +78,7 @@ def write_report(
         _summary(study, state, best, objectives),
         "<h2>Result</h2>",
         _judgement(judgement) if judgement is not None else "",
-        _result(found, trials) if found else "<p>No final evaluation yet.</p>",
+        _result(found, trials, final.control if final else None) if found else "<p>No final evaluation yet.</p>",
         decision_section(final, judgement, candidates, state) if final is not None else "",
         _running(state.running),
         *population_charts(trials, objectives[0], *best or (None,)),
@@ -206,9 +206,11 @@ def _judgement(judgement: Judgement) -> str:
     return f"{said}{table([each.row() for each in judgement.differences])}<p>{HOW} {seeds}</p>"
 
 
-def _result(found: Sequence[ConfigResult], trials: Sequence[FrozenTrial]) -> str:
-    """Return the table of the result, and the settings of each trial in it."""
+def _result(found: Sequence[ConfigResult], trials: Sequence[FrozenTrial], control: Mapping[str, Value] | None) -> str:
+    """Return the table of the result, and the settings of each configuration in it, as far as they are known."""
     of_each = {result.number: settings_of(trials, result.number) for result in found}
+    if CONTROL in of_each and control is not None:
+        of_each[CONTROL] = dict(control)
     rows = [{"configuration": name_of(number), **_settings(settings)} for number, settings in of_each.items()]
     typed_of = {number: html.escape(" ".join(overrides_of(each))) for number, each in of_each.items() if each}
     items = "".join(f"<li>{name_of(number)}: <code>{text}</code></li>" for number, text in typed_of.items())

@@ -87,7 +87,9 @@ def _task_of(settings: StudySettings, config: DictConfig) -> Task:
     returned = task.metrics(config)
     for name in settings.objectives:
         if name not in returned:
-            raise InvalidValueError(f"study.objectives names {name!r}, but a trial returns only {listed(returned)}")
+            raise InvalidValueError(
+                f"study.objectives names {name!r}, but a trial of this configuration returns only {listed(returned)}"
+            )
     for constraint in settings.constraints:
         if constraint.metric not in returned:
             raise InvalidValueError(

@@ -42,6 +42,8 @@ PRESET, SOURCE = "preset {}", "study {}"
 N_ENQUEUED = 10
 # In `study.enqueue`: the configuration of the study itself.
 DEFAULT = "default"
+# The value of a trial does not depend on it: only final trainings have evaluations.
+FINAL_EPISODES = "evaluation.episodes"
 # User attributes that a taken trial keeps.
 KEPT = (METRICS, SEEDS, ENV_STEPS)
 
@@ -194,9 +196,9 @@ def _difference(source: optuna.Study, wanted: Mapping[str, Any]) -> str | None:
     # The values of a trial are in this order.
     if [*there[OBJECTIVES].items()] != [*wanted[OBJECTIVES].items()]:
         return f"its objectives are {' and '.join(f'{way} {name}' for name, way in there[OBJECTIVES].items())}"
-    searched = tuple(f"{key}." for key in (*renamed(there[SPACE]), *wanted[SPACE]))
+    may_differ = tuple(f"{key}." for key in (*renamed(there[SPACE]), *wanted[SPACE], FINAL_EPISODES))
     different = differing(*fixed_of(source, wanted))
-    found = [(key, pair) for key, pair in different.items() if not f"{key}.".startswith(searched)]
+    found = [(key, pair) for key, pair in different.items() if not f"{key}.".startswith(may_differ)]
     if not found:
         return None
     key, (then, today) = found[0]

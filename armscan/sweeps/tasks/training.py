@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import optuna
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from optuna.exceptions import UpdateFinishedTrialError
 
 from armscan.agents import Learner
+from armscan.envs.rules import ON_BUDGET
 from armscan.errors import InvalidValueError
 from armscan.experiment.build import (
     RunSetup,
@@ -55,8 +56,13 @@ class TrainingTask:
     """The task of training an agent, with each of a trial's seeds."""
 
     def metrics(self, config: DictConfig) -> tuple[str, ...]:
-        """Return the names of the metrics of the best validation and of the training."""
-        return (*Evaluation((), on_plane_of(config)).metrics(), *TRAINING_METRICS)
+        """Return the names of the metrics of the best validation and of the training.
+
+        Where every episode has as many steps, the number of steps is none of them: all trials would be equal.
+        """
+        names = (*Evaluation((), on_plane_of(config)).metrics(), *TRAINING_METRICS)
+        is_fixed = OmegaConf.select(config, "env.ends") == ON_BUDGET
+        return tuple(name for name in names if not (is_fixed and name.startswith("mean_steps")))
 
     @property
     def final_metric(self) -> str:

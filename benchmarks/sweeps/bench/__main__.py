@@ -1,7 +1,9 @@
 """A bench for studies: which sampler, pruner and rule of seeds finds the best settings with the fewest trainings.
 
-python -m benchmarks.sweeps.bench collect sac_y [--configs N] [--seeds N] [--workers N]
+python -m benchmarks.sweeps.bench collect sac_y [OVERRIDE ...] [--configs N] [--seeds N] [--workers N]
 python -m benchmarks.sweeps.bench report sac_y [--studies N] [--workers N] [--picture FILE]
+python -m benchmarks.sweeps.bench collect-episodes sac_y [--seeds N] [--workers N]
+python -m benchmarks.sweeps.bench report-episodes sac_y [--studies N]
 python -m benchmarks.sweeps.bench warm-start sac_y sac_zy [--studies N] [--pruner NAME]
 """
 
@@ -17,9 +19,10 @@ from itertools import product
 
 from benchmarks.arguments import count, new_file, run_script
 from benchmarks.sweeps.bench.collect import collect
+from benchmarks.sweeps.bench.episodes import collect_evaluations
 from benchmarks.sweeps.bench.ranking import SAMPLERS
 from benchmarks.sweeps.bench.replay import DEFAULT, silence
-from benchmarks.sweeps.bench.report import report, with_interval
+from benchmarks.sweeps.bench.report import report, report_episodes, with_interval
 from benchmarks.sweeps.bench.warm_start import BEGUN, COLD, UNITS, SimulatedSweep, replays, share_of
 
 
@@ -29,6 +32,7 @@ def main() -> None:
     commands = parser.add_subparsers(dest="command", required=True)
     collecting = commands.add_parser("collect", help="train what is missing in a table")
     collecting.add_argument("sweep", help="name of the sweep, such as sac_y")
+    collecting.add_argument("overrides", nargs="*", help="overrides of all trainings, such as evaluation.episodes=200")
     collecting.add_argument("--configs", type=count, default=300, help="configurations (default: 300)")
     collecting.add_argument("--seeds", type=count, default=8, help="trainings of each (default: 8)")
     collecting.add_argument("--workers", type=count, default=1, help="processes that train (default: 1)")
@@ -47,6 +51,14 @@ def main() -> None:
     )
     replaying.add_argument("--workers", type=count, default=1, help="processes that simulate (default: 1)")
     replaying.add_argument("--picture", type=new_file, help="a PNG file that is written")
+    evaluating = commands.add_parser("collect-episodes", help="evaluate good configurations in many episodes")
+    evaluating.add_argument("sweep", help="name of the sweep, such as sac_y")
+    evaluating.add_argument("--seeds", type=count, default=8, help="trainings of each (default: 8)")
+    evaluating.add_argument("--workers", type=count, default=1, help="processes that train (default: 1)")
+    comparing = commands.add_parser("report-episodes", help="compare races by the episodes of their evaluations")
+    comparing.add_argument("sweep", help="name of the sweep, such as sac_y")
+    comparing.add_argument("--studies", type=count, default=200, help="simulated studies (default: 200)")
+    comparing.add_argument("--trainings", type=count, default=40, help="budget of each search (default: 40)")
     starting = commands.add_parser("warm-start", help="simulate studies that begin with known settings")
     starting.add_argument("source", help="name of the sweep that the settings are from, such as sac_y")
     starting.add_argument("target", help="name of the sweep that begins with them, such as sac_zy")
@@ -57,9 +69,22 @@ def main() -> None:
 
 def _run(given: argparse.Namespace) -> None:
     if given.command == "collect":
-        collect(given.sweep, given.configs, given.seeds, given.workers, allow_changes=given.allow_changes)
+        collect(
+            given.sweep,
+            given.configs,
+            given.seeds,
+            given.workers,
+            allow_changes=given.allow_changes,
+            overrides=given.overrides,
+        )
+        return
+    if given.command == "collect-episodes":
+        collect_evaluations(given.sweep, given.seeds, given.workers)
         return
     silence()
+    if given.command == "report-episodes":
+        report_episodes(given.sweep, n_studies=given.studies, n_trainings=given.trainings)
+        return
     if given.command == "warm-start":
         target = SimulatedSweep.of(given.target, given.pruner)
         studies = replays(SimulatedSweep.of(given.source), target, given.studies)

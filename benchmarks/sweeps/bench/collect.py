@@ -63,7 +63,7 @@ def collect(
     done = set(zip(rows.config, rows.seed, strict=True))
     missing = [(number, seed) for number in range(n_configs) for seed in range(n_seeds) if (number, seed) not in done]
     print(f"{sweep}: {len(done)} trainings are in {file.name}, {len(missing)} are missing", flush=True)
-    origin = {"fixed_sha256": design.fixed_sha256, "commit": _commit()}
+    origin = {"fixed_sha256": design.fixed_sha256, "commit": commit()}
     trained = joblib.Parallel(n_jobs=workers, return_as="generator_unordered")(
         joblib.delayed(trained_rows)(
             [f"sweep={sweep}", *overrides], {**origin, "config": number, "seed": seed}, design.configs[number]
@@ -159,6 +159,7 @@ def _shortened(metrics: dict[str, float]) -> dict[str, float]:
     return {name: float(f"{metrics[name]:.4g}") for name in METRICS}
 
 
-def _commit() -> str:
+def commit() -> str:
+    """Return the commit of the code, with `-dirty` if it has changed since."""
     command = ["git", "describe", "--always", "--dirty", "--abbrev=9"]
     return subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True).stdout.strip()

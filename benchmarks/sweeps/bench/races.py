@@ -21,7 +21,7 @@ from benchmarks.sweeps.bench.seed_rules import (
     is_ahead,
     t_race,
 )
-from benchmarks.sweeps.bench.surrogate import SimulatedConfig, Surrogate
+from benchmarks.sweeps.bench.surrogate import SELECTION_PART, SimulatedConfig, Surrogate
 
 N_SEEDS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 24, 32)
 FIXED: Mapping[str, SeedRule] = {f"{n_seeds} seeds each": fixed(n_seeds) for n_seeds in N_SEEDS}
@@ -62,6 +62,7 @@ class Comparison(NamedTuple):
         regret: Its mean regret.
         n_trainings: Its mean number of trainings.
         n_fixed: Trainings that fixed seeds need for the same regret; infinite where none of `FIXED` reaches it.
+        most_fixed: Trainings of the last one of `FIXED`.
         share: Trainings of the race as a share of `n_fixed`. Where none of `FIXED` reaches its regret, an upper bound:
             the share of the last one's trainings.
     """
@@ -70,6 +71,7 @@ class Comparison(NamedTuple):
     regret: Estimate
     n_trainings: float
     n_fixed: float
+    most_fixed: float
     share: Estimate
 
 
@@ -81,18 +83,26 @@ def candidates_of(
     return [[each.config for each in of_study.candidates[:top_k]] for of_study in found]
 
 
-def choices_of(candidates: Sequence[Sequence[SimulatedConfig]], rules: Mapping[str, SeedRule]) -> dict[str, Choices]:
+def choices_of(
+    candidates: Sequence[Sequence[SimulatedConfig]],
+    rules: Mapping[str, SeedRule],
+    *,
+    part: int = SELECTION_PART,
+    truth: int = SELECTION_PART,
+) -> dict[str, Choices]:
     """Return what rules choose in each study, all from the same simulated trainings.
 
     Args:
         candidates: Configurations of each study, the same number in each.
         rules: The rules by their names.
+        part: Part of a simulated training that the rules see. Default: its selection.
+        truth: Part whose mean is the true value of a configuration. Default: the selection.
     """
-    truths = np.array([[each.selection_truth for each in of_study] for of_study in candidates])
+    truths = np.array([[each.truth_of(truth) for each in of_study] for of_study in candidates])
     regrets = np.repeat(truths - truths.min(axis=1, keepdims=True), N_REPEATS, axis=0)
     scores = np.array(
         [
-            scores_of(of_study, MAX_SEEDS, np.random.default_rng([number, repeat]))
+            scores_of(of_study, MAX_SEEDS, np.random.default_rng([number, repeat]), part)
             for number, of_study in enumerate(candidates)
             for repeat in range(N_REPEATS)
         ]
@@ -123,7 +133,7 @@ def compare(fixed: Sequence[Choices], races: Mapping[str, Choices]) -> list[Comp
         needed = np.array([needed_for(*pair, n_of_fixed) for pair in zip(regrets, of_fixed, strict=True)])
         shares = n_trainings / needed.clip(max=n_of_fixed[-1])
         regret, share = (estimate_of(each, method="inverted_cdf") for each in (regrets, shares))
-        compared.append(Comparison(rule, regret, float(n_trainings[0]), float(needed[0]), share))
+        compared.append(Comparison(rule, regret, float(n_trainings[0]), float(needed[0]), n_of_fixed[-1], share))
     return compared
 
 

@@ -19,7 +19,7 @@ from armscan.stats.bootstrap import interquartile_mean
 from armscan.sweeps.scheduling.race import race
 from armscan.sweeps.space.parameter import Value
 from armscan.utils.arrays import FloatArray
-from benchmarks.sweeps.bench.surrogate import SimulatedConfig, Surrogate
+from benchmarks.sweeps.bench.surrogate import SELECTION_PART, SimulatedConfig, Surrogate
 
 # Limits a study: a sampler that keeps proposing points that are pruned must not run for ever.
 MAX_TRIALS_A_TRAINING = 5
@@ -173,9 +173,11 @@ def choose(scores: FloatArray, *, min_seeds: int, mean_seeds: int) -> Choice:
     return Choice(stands.chosen, sum(map(len, known.values())))
 
 
-def scores_of(candidates: Sequence[SimulatedConfig], n_seeds: int, rng: np.random.Generator) -> FloatArray:
+def scores_of(
+    candidates: Sequence[SimulatedConfig], n_seeds: int, rng: np.random.Generator, part: int = SELECTION_PART
+) -> FloatArray:
     """Return scores of fresh trainings, the negative steps of the selection, shape (candidates, seeds)."""
-    return -np.array([each.draw(rng, n_seeds)[:, -2] for each in candidates])
+    return -np.array([each.draw(rng, n_seeds)[:, part] for each in candidates])
 
 
 def silence() -> None:

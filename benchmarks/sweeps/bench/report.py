@@ -12,6 +12,7 @@ import pandas as pd
 from armscan.errors import InvalidValueError
 from armscan.utils.arrays import FloatArray
 from armscan.utils.text import markdown_table
+from benchmarks.sweeps.bench.episodes import N_BLOCKS, N_EPISODES, Evaluations, races, share_of_noise
 from benchmarks.sweeps.bench.importance import Key, keys_of
 from benchmarks.sweeps.bench.picture import draw
 from benchmarks.sweeps.bench.power import needed_seeds, power_of, residuals_of
@@ -23,6 +24,7 @@ from benchmarks.sweeps.bench.table import Curves
 
 # Candidates of the races, beside the control: those of the default study, and more.
 TOP_KS = (3, 8)
+RACE_HEAD = ("trainings", "regret", "fixed seeds need", "share")
 
 
 def report(
@@ -54,7 +56,7 @@ def report(
     keys = keys_of(curves, n_resamples)
     _print_keys(keys)
     found = candidates_of(surrogate, sweep, DEFAULT, n_studies=n_studies, n_trainings=n_trainings, top_k=max(TOP_KS))
-    control, races = surrogate.config(curves.configs[0]), {}
+    control, raced_by = surrogate.config(curves.configs[0]), {}
     if (least := min(map(len, found))) < max(TOP_KS):
         raise InvalidValueError(
             f"a search has {least} finished trials, but {max(TOP_KS)} are raced: give a larger --trainings"
@@ -63,14 +65,41 @@ def report(
         candidates = [[control, *of_study[:top_k]] for of_study in found]
         fixed = list(choices_of(candidates, FIXED).values())
         raced = choices_of(candidates, RACES)
-        races[top_k] = fixed, raced
+        raced_by[top_k] = fixed, raced
         _print_races(top_k, fixed, compare(fixed, raced))
     compared, size = rules(samplers), {"n_studies": n_studies, "n_trainings": n_trainings}
     studies = studies_of(surrogate, control, sweep, compared, **size, workers=workers)
     ranks = ranked(studies)
     _print_ranks(ranks)
     if picture is not None:
-        draw(ranks, races, keys, picture, title=f"{sweep}: {len(curves.configs)} configurations")
+        draw(ranks, raced_by, keys, picture, title=f"{sweep}: {len(curves.configs)} configurations")
+
+
+def report_episodes(sweep: str, *, n_studies: int, n_trainings: int) -> None:
+    """Print how much noise between seeds remains with more episodes, and what they are worth to a race.
+
+    Args:
+        sweep: Name of the sweep.
+        n_studies: Simulated studies.
+        n_trainings: Budget of the search of each, in whole trainings.
+    """
+    evaluated = Evaluations.read(sweep)
+    noise = evaluated.noise()
+    rows = [
+        (
+            len(some),
+            *(f"{100 * each:.0f}" for each in some.mean(axis=0) ** 0.5),
+            with_interval(share_of_noise(some), ".2f"),
+        )
+        for some in (noise, noise[: len(noise) // 4])
+    ]
+    lengths = (N_EPISODES, N_BLOCKS * N_EPISODES)
+    head = ["best configurations", *(f"noise with {each:,} episodes, in %" for each in lengths), "variance, as a share"]
+    print(f"{len(evaluated.config_of)} trainings\n\n{markdown(head, rows)}", flush=True)
+    for top_k in TOP_KS:
+        compared = races(evaluated, n_studies=n_studies, n_trainings=n_trainings, top_k=top_k)
+        rows = [(name, *_race_cells(each)) for name, each in compared.items()]
+        print(f"\n{markdown([f'{top_k} candidates and the control', *RACE_HEAD], rows)}", flush=True)
 
 
 def markdown(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
@@ -130,18 +159,18 @@ def _print_races(top_k: int, fixed: Sequence[Choices], compared: Sequence[Compar
         for n_seeds, each in zip(N_SEEDS, fixed, strict=True)
     ]
     print(f"\n{top_k} candidates and the control\n\n{markdown(['seeds of each', 'trainings', 'regret'], rows)}")
-    rows = [
-        (
-            each.rule,
-            f"{each.n_trainings:.1f}",
-            with_interval(each.regret, ".4f"),
-            f"{each.n_fixed:.1f}" if isfinite(each.n_fixed) else f"> {fixed[-1].n_trainings.mean():.0f}",
-            ("" if isfinite(each.n_fixed) else "< ") + with_interval(each.share, ".2f"),
-        )
-        for each in compared
-    ]
-    head = ["rule", "trainings", "regret", "fixed seeds need", "share"]
-    print(f"\n{markdown(head, rows)}", flush=True)
+    rows = [(each.rule, *_race_cells(each)) for each in compared]
+    print(f"\n{markdown(['rule', *RACE_HEAD], rows)}", flush=True)
+
+
+def _race_cells(race: Comparison) -> tuple[str, str, str, str]:
+    is_reached = isfinite(race.n_fixed)
+    return (
+        f"{race.n_trainings:.1f}",
+        with_interval(race.regret, ".4f"),
+        f"{race.n_fixed:.1f}" if is_reached else f"> {race.most_fixed:.0f}",
+        ("" if is_reached else "< ") + with_interval(race.share, ".2f"),
+    )
 
 
 def _print_ranks(ranks: pd.DataFrame) -> None:

@@ -27,6 +27,8 @@ from benchmarks.sweeps.bench.design import places_of, sobol, values_at
 from benchmarks.sweeps.bench.table import Curves
 
 N_TREES, N_FOLDS = 100, 10
+# Place of the selection among the epochs, the selection and the test.
+SELECTION_PART = -2
 # Points among which the best of the space is searched, a power of 2.
 N_PLACES = 2048
 
@@ -84,9 +86,7 @@ class Surrogate:
         """
         parts = curves.validation, curves.selection, curves.test
         logs = np.log(np.column_stack([part["mean_steps"] for part in parts]))
-        means, n_seeds = curves.mean_over_seeds(logs), np.bincount(curves.config_of)[curves.config_of, np.newaxis]
-        # Differences from a mean over few seeds are too small, because each seed has moved that mean.
-        residuals = (logs - means[curves.config_of]) * np.sqrt(n_seeds / (n_seeds - 1))
+        means, residuals = centred(logs, curves.config_of)
         places = curves.places()
         is_in = np.arange(len(places)) % N_FOLDS != (-1 if without is None else without)
         forest = ExtraTreesRegressor(N_TREES, random_state=seed).fit(places[is_in], means[is_in])
@@ -126,6 +126,19 @@ class Surrogate:
         configs = [values_at(self.space, row) for row in points]
         truth = self.truth(np.array([places_of(self.space, values) for values in configs]))
         return configs[int(truth.argmin())], float(truth.min())
+
+
+def centred(logs: FloatArray, config_of: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
+    """Return the mean of each configuration's trainings, and the difference of each training from it.
+
+    Args:
+        logs: Logarithms of each training, shape (trainings, parts).
+        config_of: Configuration of each training, shape (trainings,).
+    """
+    means = np.array([logs[config_of == number].mean(axis=0) for number in range(config_of.max() + 1)])
+    n_seeds = np.bincount(config_of)[config_of, np.newaxis]
+    # Differences from a mean over few seeds are too small, because each seed has moved that mean.
+    return means, (logs - means[config_of]) * np.sqrt(n_seeds / (n_seeds - 1))
 
 
 def _boxes(tree: Any) -> tuple[FloatArray, FloatArray]:
@@ -168,14 +181,10 @@ class SimulatedConfig:
     @property
     def truth(self) -> float:
         """The mean steps on the test volumes over all trainings that could be drawn."""
-        return self._truth_of(-1)
+        return self.truth_of(-1)
 
-    @property
-    def selection_truth(self) -> float:
-        """The same in the selection, on the validation volumes."""
-        return self._truth_of(-2)
-
-    def _truth_of(self, part: int) -> float:
+    def truth_of(self, part: int) -> float:
+        """Return the same of any part, such as `SELECTION_PART`."""
         logs = self.mean[part] + self.surrogate.residuals[:, part]
         return float(np.exp(logs.clip(*self.surrogate.bounds)) @ self.shares)
 

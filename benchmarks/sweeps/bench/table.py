@@ -40,9 +40,13 @@ def read_rows(file: Path) -> pd.DataFrame:
 
 
 def write_rows(file: Path, rows: pd.DataFrame) -> None:
-    """Write the rows of a table, in the order of their configurations and seeds; a reader never sees half of it."""
-    ordered = rows.sort_values(["config", "seed", "volumes", "env_steps"], ascending=[True, True, False, True])
-    text = ordered.to_csv(index=False, float_format="%.7g")
+    """Write the rows of a table, in the order of their configurations and seeds."""
+    write_sorted(file, rows, ["config", "seed", "volumes", "env_steps"], [True, True, False, True])
+
+
+def write_sorted(file: Path, rows: pd.DataFrame, by: list[str], ascending: bool | list[bool] = True) -> None:
+    """Write rows in the order of some columns; a reader never sees half of them."""
+    text = rows.sort_values(by, ascending=ascending).to_csv(index=False, float_format="%.7g")
     # The same rows give the same file.
     atomic_write(file, gzip.compress(text.encode(), mtime=0))
 

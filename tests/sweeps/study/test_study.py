@@ -240,8 +240,16 @@ def test_objective_may_be_an_on_plane_rate_as_it_is_configured():
     words = ["sweep=sac_y", "study/pruner=none", "evaluation.on_plane=[[3,5]]"]
     settings, _, _ = read_settings([*words, "study.objectives=[maximize on_plane_3mm_5deg]"])
     assert settings.objectives == {"on_plane_3mm_5deg": "maximize"}
-    with pytest.raises(InvalidValueError, match="names 'on_plane_5mm_10deg', but a trial returns"):
+    with pytest.raises(InvalidValueError, match="names 'on_plane_5mm_10deg', but a trial of this"):
         read_settings([*words, "study.objectives=[maximize on_plane_5mm_10deg]"])
+
+
+def test_steps_are_no_objective_where_every_episode_has_as_many():
+    words = ["sweep=sac_y", "study/pruner=none", "env.ends=on_budget"]
+    with pytest.raises(InvalidValueError, match="names 'mean_steps', but a trial of this configuration returns only"):
+        read_settings(words)
+    settings, _, _ = read_settings([*words, "study.objectives=[minimize median_distance_mm]"])
+    assert settings.objectives == {"median_distance_mm": "minimize"}
 
 
 @pytest.mark.parametrize(("given", "n_threads"), [("", 1), ("1,4", 1), ("2", 2), (" 3 , 1", 3)])

@@ -77,6 +77,13 @@ def test_trials_of_the_same_configuration_are_taken_with_their_values_and_count_
     assert scheduler.claim({"worker": "a"}).number == 2
 
 
+def test_trials_with_fewer_episodes_in_final_evaluations_are_taken_with_their_values(study_in):
+    fixed, before = ({"evaluation": {"episodes": n_episodes}} for n_episodes in (1000, 200))
+    study_in("before", {"agent.lr": LR}, FIXED | before, rows=[({"agent.lr": 1e-3}, 3.0)])
+    (message,) = begin(study_in("after", {"agent.lr": LR}, FIXED | fixed, warm_start=["before"]), FIXED | fixed)
+    assert message.endswith("1 taken with their values")
+
+
 def test_edited_space_takes_what_fits(study_in):
     rows = [
         ({"agent.lr": 2e-3, "agent.gamma": 0.9}, 1.0),
