@@ -180,6 +180,11 @@ def run_of_study(
         raise
     except TrackingError as error:
         raise TrackingError(f"{where}: {error}") from error
+    if run.info.lifecycle_stage != "active":
+        raise TrackingError(
+            f"{where} names run {run_id}, which was deleted in MLflow: restore it with mlflow runs restore --run-id "
+            f"{run_id}"
+        )
     if run.info.experiment_id != experiment_id:
         raise TrackingError(
             f"{where} names run {run_id}, which is another's: it is in another experiment, and left "

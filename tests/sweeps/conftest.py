@@ -52,10 +52,12 @@ def opened(tmp_path, empty_database, monkeypatch):
     shutil.copy(empty_database, tmp_path / "runs.db")
     tracking = {"uri": "sqlite:///runs.db", "experiment": "a", "artifacts": "artifacts", "wait_s": 60.0}
 
-    def open_study(storage="optuna.journal", name="a", overrides=("sweep=sac_y",), volumes=None, **changes):
+    def open_study(
+        storage="optuna.journal", name="a", overrides=("sweep=sac_y",), volumes=None, is_worker=False, **changes
+    ):
         asked = settings(name=name, storage=storage, folder=f"studies/{name}", **changes)
         config = OmegaConf.create({"tracking": tracking})
-        return open_for_work(asked, TASK, config, overrides, volumes=volumes)
+        return open_for_work(asked, TASK, config, overrides, volumes=volumes, is_worker=is_worker)
 
     open_study.store = open_store(**tracking)
     return open_study

@@ -130,7 +130,7 @@ def _print_final_results(opened: OpenedStudy, final: FinalEvaluation) -> int:
     if n_left := final.n_unjudged:
         print_error(f"trainings on the test volumes are missing ({n_left}); the same command resumes the study")
         return os.EX_TEMPFAIL
-    return 0
+    return unfinished if blocked else 0
 
 
 def _print_rows(title: str, rows: Sequence[Mapping[str, str]]) -> None:

@@ -120,3 +120,9 @@ class Space:
             each.name: distribution_to_json(each.distribution) + (f" when {dict(each.when)}" if each.when else "")
             for each in self.parameters
         }
+
+
+def is_conditional(described: str) -> bool:
+    """Return whether a key, as `Space.to_plain` describes it, is searched only beside certain choices."""
+    # Of the JSON of a distribution, the last characters are `}}`; of a condition, whose values are a tuple, `)}`.
+    return not described.endswith("}}")

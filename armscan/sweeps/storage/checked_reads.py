@@ -9,7 +9,7 @@ from typing import Any
 from optuna.storages import BaseStorage
 from optuna.trial import FrozenTrial, TrialState
 
-from armscan.errors import ArmscanError
+from armscan.errors import ArmscanError, StudyError
 from armscan.sweeps.storage.attribute_names import OF_STUDY
 from armscan.sweeps.storage.attributes import (
     DAMAGED,
@@ -44,7 +44,10 @@ class CheckedReads(BaseStorage):
         if not self.checks_reads:
             trials: list[FrozenTrial] = self._stored.get_all_trials(study_id, deepcopy, states)
             return trials
-        name = self.get_study_name_from_id(study_id)
+        try:
+            name = self.get_study_name_from_id(study_id)
+        except KeyError as error:
+            raise StudyError("the study was deleted from its storage while it ran") from error
         with _in_one_line(f"study {name!r}"):
             trials = self._stored.get_all_trials(study_id, deepcopy, states)
         unknown = [trial for trial in trials if trial._trial_id not in self._sound]

@@ -51,9 +51,9 @@ def open_for_work(
     overrides: Sequence[str],
     *,
     volumes: Mapping[str, str] | None = None,
-    retry: bool = False,
+    is_worker: bool = False,
 ) -> OpenedStudy:
-    """Open a study, and create it if there is none.
+    """Open a study; a command creates it if there is none.
 
     Args:
         settings: Settings of the study, as `read_settings` returns them.
@@ -61,17 +61,20 @@ def open_for_work(
         config: Configuration of its trials without the searched values.
         overrides: Overrides that its trials are composed from.
         volumes: Checksums of its volumes; see `volume_sums`. Default: None, they are not compared.
-        retry: Whether to wait for a store or a storage that is unavailable. Default: False.
+        is_worker: Whether a worker opens it, which waits for a store or a storage that is unavailable, and creates no
+            study: one that is gone was deleted. Default: False.
 
     Raises:
         StudyError: If the storage cannot be used, or the study that exists is another.
         TrackingError: If the tracking store cannot be used.
     """
-    retry_s = RETRY_S if retry else None
+    retry_s = RETRY_S if is_worker else None
     store, experiment_id = open_store(**to_plain(config.tracking), retry_s=retry_s)
     for folder in (settings.folder, settings.artifacts):
         Path(folder).mkdir(parents=True, exist_ok=True)
-    storage = open_storage(settings.storage, retry=retry)
+    storage = open_storage(settings.storage, retry=is_worker)
+    if is_worker and settings.name not in storage.study_names:
+        raise StudyError(f"study {settings.name} is not in its storage any more: it was deleted while it ran")
     study = make_study(storage, settings, fixed_config(config, overrides, volumes))
     is_command = volumes is not None
     _claim_folder(Path(settings.folder), study)

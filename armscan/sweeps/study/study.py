@@ -22,6 +22,7 @@ from armscan.errors import StudyError, few
 from armscan.sweeps.scheduling.population import searched_values
 from armscan.sweeps.scheduling.state import is_feasible, loss_signs
 from armscan.sweeps.space.parameter import hydra_literal
+from armscan.sweeps.space.space import is_conditional
 from armscan.sweeps.storage.attribute_names import (
     EARLIER_CONFIGS,
     FIXED,
@@ -265,11 +266,15 @@ def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
 def best_trials(study: optuna.Study, n_best: int) -> list[FrozenTrial]:
     """Return the best trials of a study, each with different values, the best first.
 
-    Trials that violate a constraint are left out, and in a population all but each member's latest. With several
-    objectives these are the trials on the Pareto front, ordered by the first objective.
+    Trials that violate a constraint are left out, and in a population all but each member's latest. So are trials
+    that lack a value which every trial of armscan has: they were told to Optuna by others. With several objectives
+    these are the trials on the Pareto front, ordered by the first objective.
     """
     several = len(study.directions) > 1
-    trials = study.best_trials if several else study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+    found = study.best_trials if several else study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+    space = renamed(study.user_attrs.get(SPACE, {}))
+    required = {key for key, described in space.items() if not is_conditional(described)}
+    trials = [trial for trial in found if required <= renamed(searched_values(trial)).keys()]
     by_generation = sorted(trials, key=lambda trial: trial.user_attrs.get(GENERATION, 0))
     latest = {trial.user_attrs[MEMBER]: trial for trial in by_generation if MEMBER in trial.user_attrs}
     trials = list(filter(is_feasible, latest.values() or trials))

@@ -214,7 +214,7 @@ def work(overrides: Sequence[str], make_heartbeat: Callable[..., Heartbeat]) -> 
         ServiceUnavailableError: If the storage or the tracking store is unavailable for longer than a worker waits.
     """
     silence_libraries()
-    opened = open_for_work(*read_settings(overrides), overrides, retry=True)
+    opened = open_for_work(*read_settings(overrides), overrides, is_worker=True)
 
     def run_phase(phase: Phase, other: Phase | None) -> str | None:
         heartbeat = make_heartbeat(phase.scheduler, on_death=phase.close_runs_of)

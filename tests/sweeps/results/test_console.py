@@ -22,7 +22,9 @@ def searched(study):
     """Return the study after its search."""
     search = study.search.scheduler.study
     for _ in range(study.settings.n_trials):
-        search.tell(search.ask(), 1.0)
+        trial = search.ask()
+        study.search.space.suggest(trial)
+        search.tell(trial, 1.0)
     return study
 
 

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import optuna
 import pytest
+from mlflow import MlflowClient
 from optuna.trial import TrialState
 from optuna_dashboard import get_note, save_note
 
@@ -174,3 +175,25 @@ def test_study_that_was_begun_in_another_folder_notes_it_and_a_population_is_ref
     moved.rename(first)
     assert opened(volumes={}).folder == first
     assert capsys.readouterr().out == ""
+
+
+def test_study_whose_run_was_deleted_in_mlflow_names_the_command_that_restores_it(opened):
+    run_id = opened().search.run_id
+    store, _ = opened.store
+    MlflowClient(store.uri).delete_run(run_id)
+    line = (
+        f"a.user_attrs.mlflow_run names run {run_id}, which was deleted in MLflow: restore it with mlflow runs restore"
+    )
+    with pytest.raises(TrackingError, match=line):
+        opened()
+
+
+def test_study_that_was_deleted_while_it_ran_is_not_created_again(opened):
+    search = opened().search
+    storage = search.scheduler.storage
+    optuna.delete_study(study_name="a", storage=storage.optuna)
+    with pytest.raises(StudyError, match="was deleted from its storage while it ran"):
+        search.scheduler.state()
+    with pytest.raises(StudyError, match="not in its storage any more"):
+        opened(is_worker=True)
+    assert storage.study_names == []

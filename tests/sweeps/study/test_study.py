@@ -14,7 +14,7 @@ from armscan.sweeps.study.arguments import StudyCommand, trial_overrides
 from armscan.sweeps.study.components import read_settings
 from armscan.sweeps.study.final_eval_storage import open_final_eval
 from armscan.sweeps.study.settings import FinalEvalSettings, StudySettings
-from armscan.sweeps.study.study import LATER, change_notes, existing_study, make_study
+from armscan.sweeps.study.study import LATER, best_trials, change_notes, existing_study, make_study
 
 FIXED = {"agent": {"lr": 1e-3, "gamma": 0.9}, "seed": 3, "device": "cpu", "tracking": {"uri": "a"}}
 
@@ -288,3 +288,23 @@ def test_study_with_other_constraints_is_refused_although_changes_are_allowed(st
         StudyError, match=r"has other constraints: study\.constraints was \[\], is \['training_s <= 60'\]"
     ):
         make_study(storage, changed, {})
+
+
+def test_trial_without_a_value_of_every_key_is_never_best():
+    space = Space.read(
+        {
+            "agent.lr": {"low": 1e-4, "high": 0.5},
+            "network": {"choices": ["auto", "mlp"]},
+            "stack": {"choices": [1], "when": {"network": "mlp"}},
+        }
+    )
+    study = optuna.create_study()
+    study.set_user_attr("space", space.to_plain())
+    for params in ({}, {"agent.lr": 0.1}, {"agent.lr": 0.1, "network": "auto"}):
+        study.enqueue_trial(params)
+        trial = study.ask()
+        for each in space.parameters:
+            if each.name in params:
+                trial._suggest(each.name, each.distribution)
+        study.tell(trial, float(trial.number))
+    assert [trial.number for trial in best_trials(study, 3)] == [2]
