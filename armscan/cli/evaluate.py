@@ -59,7 +59,7 @@ OPTIONS = {
     "--episodes",
     type=click.IntRange(1),
     show_default=f"{N_EPISODES}; {N_VIDEO_EPISODES} with --video",
-    help="Episodes for each split, in turn on its volumes.",
+    help="Number of episodes on each split; they cycle through its volumes.",
 )
 @click.option(
     "--seed",
@@ -114,7 +114,7 @@ def evaluate(
     RUN is an MLflow run ID or its first characters. With --agent, any KEY=VALUE of armscan run configures
     the agent instead, experiment=PRESET included.
 
-    The rules of the episodes and --device are the agent's own by default. docs/metrics.md explains the metrics,
+    By default, the rules of the episodes and the device are the agent's own. docs/metrics.md explains the metrics,
     docs/seeing.md the video.
     """
     # As in `armscan run`: the evaluation's run is closed as KILLED.

@@ -59,7 +59,7 @@ def charts_of(
     # Optuna draws a front of two or three objectives.
     if len(objectives) in (2, 3):
         figure = plot_pareto_front(study, target_names=list(map(title_of, objectives)))
-        said = "Red: trials that no other is better than. Blue: the other trials that have run to their end."
+        said = "Red: trials that no other dominates. Blue: the other completed trials."
         said += f" Grey: {violating}" if violating else ""
         yield _titled("Pareto front", figure.update_layout(height=HEIGHT_PX), said)
     for number, (objective, direction) in enumerate(zip(objectives, study.directions, strict=True)):

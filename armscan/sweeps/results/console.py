@@ -58,7 +58,7 @@ def print_result(opened: OpenedStudy) -> int:
         print_sentence(f"the search has ended: {limit}")
     is_any_complete = len(state.finished) > state.n_pruned
     if settings.constraints and is_any_complete and not best_trials(scheduler.study, 1):
-        print(f"no trial keeps all constraints: {', '.join(map(str, settings.constraints))}")
+        print(f"no trial satisfies all constraints: {', '.join(map(str, settings.constraints))}")
     _print_best(opened)
     code = 0 if opened.final_eval is None else _print_final_results(opened, opened.final_eval)
     print_where_to_look(opened.folder, opened.config.tracking.uri, storage=settings.storage)
@@ -112,7 +112,7 @@ def _print_final_results(opened: OpenedStudy, final: FinalEvaluation) -> int:
         _print_rows(title, [each.row(objective) for each in candidates])
     judgement = judge(final)
     if judgement is None or judgement.of_chosen is None:
-        nothing = "final training has finished" if candidates else "trial is complete and keeps all constraints"
+        nothing = "final training has finished" if candidates else "trial is complete and satisfies all constraints"
         if judgement is not None:
             nothing = "training of the chosen configuration on the test volumes has finished"
         code, reason = 1, f"no {nothing}"

@@ -102,7 +102,7 @@ class Judgement:
         if self.chosen == CONTROL and self.have_others_failed:
             return "The control was chosen, because trainings of all other candidates have failed."
         if self.chosen == CONTROL:
-            of_them = " that keeps all constraints" if self.violated and CONTROL not in self.violated else ""
+            of_them = " that satisfies all constraints" if self.violated and CONTROL not in self.violated else ""
             return (
                 f"No setting{of_them} beat the control, the study's configuration without the searched values, in the "
                 "selection on the validation volumes."

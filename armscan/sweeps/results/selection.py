@@ -149,7 +149,7 @@ def decision_section(
         f"candidate, and the control, gets {n_seeds} first. "
         f"{further if settings.min_seeds < settings.mean_seeds else ''}"
         + (
-            "The candidate whose interval has the best pessimistic end is chosen."
+            "The configuration with the best conservative bound is chosen."
             if settings.mean_seeds > 1
             else "The candidate with the best score is chosen: one seed gives no interval."
         ),
