@@ -79,6 +79,9 @@ def scheduled_algorithms(algorithm: Algorithm, schedule: Sequence[Segment]) -> l
                 f"agent.pretraining_env_steps = {pretraining}: only the pretraining has a schedule"
             )
         changing: Any = algorithm
-        algorithm = dataclasses.replace(changing, **segment.values)
+        try:
+            algorithm = dataclasses.replace(changing, **segment.values)
+        except InvalidValueError as error:
+            raise InvalidValueError(f"{KEY}[{number}]: {error}") from error
         algorithms.append((segment.from_env_steps, algorithm))
     return algorithms

@@ -27,7 +27,7 @@ Curves = Mapping[tuple[str, str, int], Curve]
 
 # More groups would hide each other behind their bands and seeds.
 MANY = 6
-ROW_PX, LEGEND_ROW_PX, GROUP_PX, AROUND_PX, SWITCHES_PX = 250, 22, 34, 110, 84
+ROW_PX, LEGEND_ROW_PX, GROUP_PX, LINE_PX, AROUND_PX, SWITCHES_PX = 250, 22, 34, 16, 110, 84
 # Widths in the legend: all of it, one letter, and the line beside a name.
 LEGEND_PX, LETTER_PX, SAMPLE_PX = 950, 7, 50
 BANDS, SEEDS = "band", "seed"
@@ -176,7 +176,9 @@ def final_chart(
             add_estimate(figure, label, colour, estimate, seeds, hover, row=1, col=column)
         figure.update_xaxes(title=title, row=1, col=column, **(RATE_AXIS if is_rate(name) else {}))
     figure.update_yaxes(autorange="reversed", automargin=True)
-    height = AROUND_PX + GROUP_PX * len(rows)
+    # The rows are equally high.
+    n_lines = max(label.count("<br>") + 1 for label, *_ in rows)
+    height = AROUND_PX + max(GROUP_PX, LINE_PX * n_lines + LINE_PX // 2) * len(rows)
     return figure.update_layout(height=height, margin={"t": 20, "b": 50, "l": 10, "r": 20})
 
 
