@@ -50,6 +50,7 @@ class LabellingOptions:
         markup: Markups file with the plane of `volume`, which replaces the search. Default: None.
         volume: Name of the volume that `markup` is for; it may already have a plane. Default: None.
         search: Function that finds the plane of a volume. Default: None, `find_optimal_plane`.
+        found_by: MLflow run ID of the agent that `search` applies. Default: None, no agent.
     """
 
     data: Path
@@ -61,6 +62,7 @@ class LabellingOptions:
     markup: Path | None = None
     volume: str | None = None
     search: Search | None = None
+    found_by: str | None = None
 
 
 def label(options: LabellingOptions) -> tuple[list[tuple[LabelVolume, FoundPlane]], list[ArmscanError]]:
@@ -92,7 +94,8 @@ def label(options: LabellingOptions) -> tuple[list[tuple[LabelVolume, FoundPlane
         _write_picture(options.pictures / f"{name}.png", volume, plane.action, options.tissues)
         if options.markups:
             _write_markup(options.pictures, volume, plane.action)
-        record_planes(options.data, {name: (plane.action, plane.score)}, read_with=dataset.manifest)
+        planes = {name: (plane.action, plane.score)}
+        record_planes(options.data, planes, found_by=options.found_by, read_with=dataset.manifest)
         labelled.append((volume, plane))
     return labelled, failures
 

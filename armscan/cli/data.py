@@ -105,6 +105,7 @@ def label(
         markup=markup,
         volume=volume,
         search=search,
+        found_by=None if search is None else search.run_id,
     )
     labelled, failures = label_planes(options)
     if labelled:

@@ -12,6 +12,7 @@ from rich.text import Text
 from armscan.config.command_hints import armscan_command
 from armscan.errors import few, listed
 from armscan.utils.console import WHOLE_CHARS, print_sentence, print_table, wide_console
+from armscan.utils.run_files import ID_CHARS
 from armscan.utils.text import MISSING, counted
 
 if TYPE_CHECKING:
@@ -37,7 +38,8 @@ def print_dataset(dataset: Dataset, folder: Path) -> None:
     planes = {name: _plane_of(report.volume) for name, report in dataset.reports.items()}
     for name, report in dataset.reports.items():
         split = f"for {dataset.splits[name]}, " if dataset.splits else ""
-        console.print(Text(f"{name}: subject {dataset.subjects[name]}, {split}{planes[name]}", style="bold"))
+        by = f" (found by the agent of run {agent[:ID_CHARS]})" if (agent := dataset.found_by.get(name)) else ""
+        console.print(Text(f"{name}: subject {dataset.subjects[name]}, {split}{planes[name]}{by}", style="bold"))
         console.print(Text(_geometry(report)))
         console.print(_tissue_table(report))
         for note in (*report.notes, *(_coarse_note(report.volume) if report.has_size_of_an_arm else ())):
@@ -159,7 +161,7 @@ def print_planes(options: LabellingOptions, labelled: Sequence[tuple[LabelVolume
             print_sentence(f"note: {volume.name} scores {plane.score:.3f}, and {wanted}")
     print(f"look at   {options.pictures}")
     print("accept    do nothing")
-    print("reject    in the manifest, remove rotation, translation and score from the")
+    print("reject    in the manifest, remove rotation, translation, score and found_by from the")
     print("          volume's entry, or give the entry an exclude: REASON")
     if not options.markups:
         print("          (--markups writes the planes as files for 3D Slicer)")

@@ -56,6 +56,11 @@ class AgentSearch:
         self._source = replace(source, config=config)
         self._own = cache(partial(own_split, source, ("training",)))
 
+    @property
+    def run_id(self) -> str | None:
+        """MLflow run ID of the agent; None for an agent without a run."""
+        return self._source.run.run_id if self._source.run else None
+
     def __call__(self, volume: LabelVolume) -> FoundPlane:
         """Return the last plane of the episode.
 

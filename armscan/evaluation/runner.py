@@ -19,6 +19,7 @@ from armscan.evaluation.volumes import (
     VolumesByName,
     are_known,
     known_volumes,
+    notes_on_planes,
     own_split,
     phantom_version,
     volume_groups,
@@ -117,6 +118,7 @@ def prepare_agent(
     notes = list(prepared.notes)
     if data not in (None, PHANTOM):
         notes += palm_notes({name: volume for of_group in groups.values() for name, volume in of_group.items()})
+        notes += notes_on_planes(data, source.run.run_id if source.run else None)
     is_elsewhere = bool(data and source.run)
     known = known_volumes(source, groups) if is_elsewhere else []
     own_groups = [label for label, volumes in groups.items() if is_elsewhere and are_known(source, volumes)]

@@ -11,13 +11,13 @@ from hydra.utils import instantiate
 
 from armscan.config.defaults import PHANTOM
 from armscan.config.error_messages import one_line_message
-from armscan.errors import InvalidValueError
+from armscan.errors import InvalidValueError, few
 from armscan.evaluation.agent_source import EvaluatedAgent
 from armscan.tracking.tags import SUBJECTS, VOLUMES
 from armscan.training import PARTS, TEST, TRAINING, VALIDATION, Split, check_unchanged
 from armscan.utils.files import check_writable, sha256
 from armscan.volumes import LabelVolume, load_phantoms, open_dataset
-from armscan.volumes.dataset import SPLITS
+from armscan.volumes.dataset import SPLITS, planes_found_by
 from armscan.volumes.phantom import VERSIONS
 
 # Above the seeds of a run's phantoms: its test phantoms begin a million below.
@@ -82,6 +82,26 @@ def volume_groups(
     dataset = open_dataset(data)
     groups = {f"{split} split": dataset.volumes_of(split) for split in SPLITS}
     return {label: volumes for label, volumes in groups.items() if volumes} or {"volumes": dataset.volumes}
+
+
+def notes_on_planes(folder: str, run_id: str | None) -> list[str]:
+    """Return a note if agents have found labelled planes of a folder, and another if the agent of this run has.
+
+    Args:
+        folder: Folder of the volumes.
+        run_id: MLflow run ID of the agent; None for an agent without a run.
+    """
+    found_by = planes_found_by(folder)
+    own = [name for name, agent in found_by.items() if agent == run_id]
+    notes = []
+    if others := [name for name in found_by if name not in own]:
+        notes.append(f"agents have found the labelled planes of {few(others)}: distances are from planes of agents")
+    if own:
+        notes.append(
+            f"this agent has found the labelled planes of {few(own)} itself: on these volumes, the figures say whether "
+            "it finds the same plane again, not how far it is from the right one"
+        )
+    return notes
 
 
 def data_name(data: str | None) -> str:

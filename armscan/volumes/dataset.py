@@ -27,7 +27,7 @@ from armscan.volumes.volume import LabelVolume
 from armscan.volumes.volume_report import VolumeReport
 
 if TYPE_CHECKING:
-    from armscan.volumes.manifest_schema import Manifest, Splits
+    from armscan.volumes.manifest_schema import Manifest, Splits, VolumeEntry
 
 SPLITS = ("train", "validation", "test")
 Key = TypeVar("Key", bound=Hashable)
@@ -44,6 +44,7 @@ class Dataset:
             splits.
         excluded: Reason why a volume of the folder was left out, by file name. Default: none.
         manifest: Manifest that the volumes were read with. Default: None, unknown.
+        found_by: MLflow run ID of the agent that found a volume's plane, by file name. Default: none, no agent did.
     """
 
     volumes: dict[str, LabelVolume]
@@ -51,6 +52,7 @@ class Dataset:
     splits: dict[str, str] | None = None
     excluded: dict[str, str] = field(default_factory=dict)
     manifest: Manifest | None = None
+    found_by: dict[str, str] = field(default_factory=dict)
 
     @property
     def subjects(self) -> dict[str, str]:
@@ -112,7 +114,19 @@ def open_dataset(path: str | Path, *, require_manifest: bool = True) -> Dataset:
         splits=splits,
         excluded={name: str(entry.exclude) for name, entry in entries.items() if entry.exclude},
         manifest=manifest,
+        found_by=_found_by(used),
     )
+
+
+def planes_found_by(path: str | Path) -> dict[str, str]:
+    """Return the MLflow run ID of the agent that found a volume's plane, by file name, without reading a volume."""
+    found, manifest, files = _manifest_of(path, require_manifest=True)
+    entries = volume_entries(manifest, files, found)
+    return _found_by({name: entry for name, entry in entries.items() if not entry.exclude})
+
+
+def _found_by(entries: Mapping[str, VolumeEntry]) -> dict[str, str]:
+    return {name: entry.found_by for name, entry in entries.items() if entry.found_by and entry.plane}
 
 
 def subjects_in(path: str | Path, n_volumes: int | None = None) -> list[str]:

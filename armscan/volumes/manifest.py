@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 MANIFEST_NAMES = ("manifest.yaml", "manifest.yml", "manifest.json", "optimal_actions.json")
 ENTRIES_ONLY = MANIFEST_NAMES[-1]
 NEW_MANIFEST = MANIFEST_NAMES[0]
+# Key of the agent that has found a plane.
+FOUND_BY = "found_by"
 SUFFIXES = (".yaml", ".yml", ".json")
 # Keys allowed both in an entry and at the top of a manifest.
 SHARED_KEYS = ("labels", "orientation", "axes", "overlap")
@@ -99,6 +101,7 @@ def record_planes(
     folder: str | Path,
     planes: Mapping[str, tuple[ManipulatorAction, float]],
     *,
+    found_by: str | None = None,
     read_with: Manifest | None = None,
 ) -> Path:
     """Write optimal planes into the manifest of a folder, leaving everything else in it unchanged.
@@ -109,6 +112,7 @@ def record_planes(
         folder: Folder of the volumes.
         planes: Labelled plane and its reward in [-1, 0], by file name; the plane is in the frame of the volume that
             `open_dataset` returns.
+        found_by: MLflow run ID of the agent that found the planes. Default: None, no agent did.
         read_with: Manifest that these volumes were read with, for an error if their settings have changed since.
             Default: None, no such check.
 
@@ -122,7 +126,7 @@ def record_planes(
         VolumeError: If the folder cannot be used.
     """
     folder = check_path("the folder of volumes", folder)
-    recorded = _checked_planes(planes)
+    recorded = {name: {**keys, FOUND_BY: found_by} for name, keys in _checked_planes(planes).items()}
     files = volume_files(folder)
     if unknown := [name for name in recorded if name not in files]:
         raise ManifestError(f"{folder}: a plane is given for {few(unknown)}, but the folder holds {few(files)}")
@@ -162,7 +166,7 @@ def _recorded(
             )
     entries = document.get("volumes")
     entries = {name: {} for name in files} if entries is None else entries
-    entries = {**entries, **{name: {**entries.get(name, {}), **keys} for name, keys in recorded.items()}}
+    entries = {**entries, **{name: _updated({**entries.get(name, {})}, keys) for name, keys in recorded.items()}}
     document = {**document, "volumes": entries}
     try:
         if path.suffix == ".json":
@@ -199,12 +203,20 @@ def _edited(text: str, recorded: dict[str, Document], wanted: Document) -> str:
         # Other entries may be aliases of one with an anchor: they stay as they are.
         has_anchor = isinstance(entry, CommentedMap) and entry.anchor.value is not None
         entries[name] = entry.copy() if has_anchor else entry
-        entries[name].update(keys)
+        _updated(entries[name], keys)
     edited = StringIO()
     editor.dump(document, edited)
     if load_yaml(edited.getvalue()) != wanted:
         raise ValueError("its anchors, aliases or merged keys would change other values: write them out")
     return edited.getvalue()
+
+
+def _updated(entry: Document, keys: Mapping[str, Any]) -> Document:
+    """Update an entry with the keys of a plane; one that no agent has found loses the key of the agent."""
+    entry.update({key: value for key, value in keys.items() if value is not None})
+    if keys[FOUND_BY] is None:
+        entry.pop(FOUND_BY, None)
+    return entry
 
 
 def _checked_planes(planes: Any) -> dict[str, Document]:

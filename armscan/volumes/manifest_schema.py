@@ -88,6 +88,7 @@ class VolumeEntry(_Settings):
     rotation: Rotation | None = None
     translation: Translation | None = None
     score: Score | None = None
+    found_by: Text | None = None
     subject: Subject | None = Field(
         default=None, min_length=1, description="a string that is not empty (quote numbers)"
     )

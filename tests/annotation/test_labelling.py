@@ -13,6 +13,7 @@ import armscan.annotation.labelling
 from armscan.anatomy import find_optimal_plane
 from armscan.cli.main import main
 from armscan.envs import ArmscanEnv
+from armscan.evaluation.volumes import notes_on_planes
 from armscan.volumes import ManipulatorAction, open_dataset, plane_distance, read_markup, read_volume, write_markup
 from tests.support.tracked_runs import tracked
 
@@ -75,6 +76,12 @@ def test_label_takes_the_planes_that_an_agent_finds(bare, names, database, tmp_p
     assert planes(bare)[names[0]] is None
     assert planes(bare)[names[1]] is not None
     assert "planes written into the manifest" in capsys.readouterr().out
+    (note,) = notes_on_planes(str(bare), run_id)
+    assert note.startswith(f"this agent has found the labelled planes of {names[1]} itself")
+    (note,) = notes_on_planes(str(bare), None)
+    assert note == f"agents have found the labelled planes of {names[1]}: distances are from planes of agents"
+    assert main(["data", "inspect", str(bare)]) == 0
+    assert f" (found by the agent of run {run_id[:8]})" in capsys.readouterr().out
     assert "and its environment holds rz and rx and tx at the labelled plane" in refused(
         [str(bare), f"--agent={tracked(tmp_path)}", store], capsys
     )

@@ -11,6 +11,7 @@ import yaml
 
 from armscan.errors import InvalidValueError, ManifestError, VolumeError
 from armscan.volumes import LabelMap, ManipulatorAction, open_dataset, record_planes
+from armscan.volumes.dataset import planes_found_by
 from tests.support import REPOSITORY
 from tests.volumes.test_dataset import PLANE
 
@@ -379,3 +380,13 @@ def test_manifest_that_is_no_yaml_is_answered_with_the_place(folder):
     (folder / "manifest.yaml").write_text("volumes:\n  a.nii.gz: {exclude: bad: motion}\n")
     with pytest.raises(ManifestError, match=r"as YAML \(did not find expected .* in line 2, column \d+\)"):
         open_dataset(folder)
+
+
+@pytest.mark.parametrize("name", ["manifest.yaml", "manifest.json"])
+def test_plane_that_an_agent_has_found_names_it_until_another_is_recorded(folder, name):
+    (folder / name).write_text('{"volumes": {"a.nii.gz": {"subject": "S1"}, "b.nrrd": {}}}')
+    record_planes(folder, {"a.nii.gz": (ACTION, -0.1)}, found_by="0a1b")
+    assert open_dataset(folder).found_by == planes_found_by(folder) == {"a.nii.gz": "0a1b"}
+    record_planes(folder, {"a.nii.gz": (ACTION, -0.1)})
+    dataset = open_dataset(folder)
+    assert (dataset.found_by, dataset.subjects["a.nii.gz"]) == ({}, "S1")
