@@ -164,7 +164,8 @@ def unavailable_reason(error: BaseException) -> str | None:
 
 def reason_in(error: BaseException) -> str:
     """Return the text of an error, short and without a password."""
-    text = mask_passwords(in_one_line(error))
+    # SQLAlchemy's message ends with the statement and its parameters.
+    text = mask_passwords(in_one_line(error)).partition(" [SQL: ")[0]
     if told := SHORT.search(text):
         return next(part for part in told.groups() if part).strip()
     return text[:MAX_REASON_CHARS]

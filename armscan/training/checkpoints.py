@@ -142,14 +142,15 @@ def _restore(learner: Learner, last: Path, provenance: CheckpointProvenance) -> 
     reports = _read(facts.get("reports"), last)
     try:
         learner.load_state(state)
+        n_env_steps = learner.n_env_steps
     # The checksum is right, so the state was written with other contents.
     except (LookupError, TypeError, ValueError, AttributeError, RuntimeError, AssertionError, OverflowError) as error:
         if isinstance(error, CheckpointError):
             raise
         raise CheckpointError(f"{last}: does not hold the state of this agent: {error!r}") from error
-    if learner.n_env_steps != reports[-1].n_env_steps:
+    if n_env_steps != reports[-1].n_env_steps:
         raise CheckpointError(
-            f"{last}: the agent has taken {learner.n_env_steps} environment steps, but its last epoch reports "
+            f"{last}: the agent has taken {n_env_steps} environment steps, but its last epoch reports "
             f"{reports[-1].n_env_steps}"
         )
     return reports

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import requests
+import sqlalchemy
 from mlflow import MlflowClient
 
 from armscan.cli.main import main
@@ -342,3 +343,8 @@ def test_reason_shows_no_password(monkeypatch):
     monkeypatch.setenv("MLFLOW_TRACKING_PASSWORD", "hidden")
     error = OSError("http://me:other@host:1/: hidden is wrong")
     assert unavailable_reason(error) == reason_in(error) == "http://me:***@host:1/: *** is wrong"
+
+
+def test_reason_of_a_database_has_neither_the_statement_nor_its_parameters():
+    error = sqlalchemy.exc.OperationalError("INSERT INTO tags", ("secret",), OSError("database or disk is full"))
+    assert reason_in(error) == "(builtins.OSError) database or disk is full"
