@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import optuna
 from omegaconf import DictConfig, OmegaConf
@@ -45,9 +44,6 @@ from armscan.training import (
 from armscan.training.episode_seeds import SELECTION_SEED, VIDEO_SEED
 from armscan.utils.log import log
 from armscan.utils.run_files import LEARNING_CURVE_FILE, RUN_FILE, VIDEO_FILE, folder_lock
-
-if TYPE_CHECKING:
-    pass
 
 Conclude = Callable[[RunSetup, TrainingResult, TrackedRun, Path], dict[str, float]]
 

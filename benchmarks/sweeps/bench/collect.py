@@ -5,8 +5,9 @@ from __future__ import annotations
 import subprocess
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -64,19 +65,36 @@ def collect(
     missing = [(number, seed) for number in range(n_configs) for seed in range(n_seeds) if (number, seed) not in done]
     print(f"{sweep}: {len(done)} trainings are in {file.name}, {len(missing)} are missing", flush=True)
     origin = {"fixed_sha256": design.fixed_sha256, "commit": commit()}
-    trained = joblib.Parallel(n_jobs=workers, return_as="generator_unordered")(
-        joblib.delayed(trained_rows)(
-            [f"sweep={sweep}", *overrides], {**origin, "config": number, "seed": seed}, design.configs[number]
-        )
-        for number, seed in missing
+    run_jobs(
+        [
+            joblib.delayed(trained_rows)(
+                [f"sweep={sweep}", *overrides], {**origin, "config": number, "seed": seed}, design.configs[number]
+            )
+            for number, seed in missing
+        ],
+        rows,
+        partial(write_rows, file),
+        workers,
     )
+
+
+def run_jobs(jobs: Sequence[Any], rows: pd.DataFrame, write: Callable[[pd.DataFrame], None], workers: int) -> None:
+    """Run trainings, and write a table after each of them.
+
+    Args:
+        jobs: Calls that return the rows of a training, delayed by joblib.
+        rows: Rows that the table has already.
+        write: Function that writes all rows.
+        workers: Processes that train.
+    """
     start_s = time.monotonic()
+    trained = joblib.Parallel(n_jobs=workers, return_as="generator_unordered")(jobs)
     for n_trained, of_training in enumerate(trained, start=1):
         fresh = pd.DataFrame(of_training)
         rows = pd.concat([rows, fresh], ignore_index=True) if len(rows) else fresh
-        write_rows(file, rows)
+        write(rows)
         each_s = (time.monotonic() - start_s) / n_trained
-        print(f"{n_trained} of {len(missing)} trainings, {each_s:.1f} s each", flush=True)
+        print(f"{n_trained} of {len(jobs)} trainings, {each_s:.1f} s each", flush=True)
 
 
 def trained_rows(words: Sequence[str], training: Mapping[str, Any], values: dict[str, Any]) -> list[dict[str, Any]]:

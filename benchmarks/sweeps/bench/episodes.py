@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +16,11 @@ from numpy.typing import NDArray
 from armscan.errors import InvalidValueError
 from armscan.stats.bootstrap import Estimate
 from armscan.utils.arrays import FloatArray
-from benchmarks.sweeps.bench.collect import commit, train_and_evaluate
+from benchmarks.sweeps.bench.collect import commit, run_jobs, train_and_evaluate
 from benchmarks.sweeps.bench.importance import estimate_of
 from benchmarks.sweeps.bench.power import GOOD
 from benchmarks.sweeps.bench.races import FIXED, N_RESAMPLES, RACES, Choices, Comparison, choices_of, compare
 from benchmarks.sweeps.bench.replay import DEFAULT, search
-from benchmarks.sweeps.bench.seed_rules import SeedRule
 from benchmarks.sweeps.bench.surrogate import Surrogate, centred
 from benchmarks.sweeps.bench.table import FOLDER, MIN_SEEDS, SELECTION, Curves, write_sorted
 
@@ -58,21 +58,18 @@ def collect_evaluations(
     missing = [(number, seed) for seed in range(n_seeds) for number in good if (number, seed) not in done]
     print(f"{sweep}: {len(done)} trainings are in {file.name}, {len(missing)} are missing", flush=True)
     words = [f"sweep={sweep}", *overrides, f"evaluation.episodes={N_BLOCKS * N_EPISODES}"]
-    trained = joblib.Parallel(n_jobs=workers, return_as="generator_unordered")(
-        joblib.delayed(_evaluated)(words, curves.configs[number], {"commit": commit(), "config": number, "seed": seed})
+    origin, write = {"commit": commit()}, partial(write_sorted, file, by=["config", "seed"])
+    jobs = [
+        joblib.delayed(_evaluated)(words, curves.configs[number], {**origin, "config": number, "seed": seed})
         for number, seed in missing
-    )
-    for n_trained, row in enumerate(trained, start=1):
-        fresh = pd.DataFrame([row])
-        rows = pd.concat([rows, fresh], ignore_index=True) if len(rows) else fresh
-        write_sorted(file, rows, ["config", "seed"])
-        print(f"{n_trained} of {len(missing)} trainings", flush=True)
+    ]
+    run_jobs(jobs, rows, write, workers)
 
 
-def _evaluated(words: Sequence[str], values: dict[str, Any], row: dict[str, Any]) -> dict[str, Any]:
+def _evaluated(words: Sequence[str], values: dict[str, Any], row: dict[str, Any]) -> list[dict[str, Any]]:
     _, evaluations = train_and_evaluate(words, values, row["seed"])
     n_steps = np.array([each.n_steps for each in evaluations[SELECTION].episodes])
-    return row | dict(zip(COLUMNS, n_steps.reshape(N_BLOCKS, -1).mean(axis=1), strict=True))
+    return [row | dict(zip(COLUMNS, n_steps.reshape(N_BLOCKS, -1).mean(axis=1), strict=True))]
 
 
 @dataclass(frozen=True)
@@ -155,16 +152,17 @@ def races(evaluated: Evaluations, *, n_studies: int, n_trainings: int, top_k: in
         raced = [curves.configs[0], *(each.values for each in found)]
         candidates.append([simulated.config(values) for values in raced])
 
-    def chosen(rules: Mapping[str, SeedRule], parts: Iterable[int]) -> dict[str, Choices]:
+    def chosen(parts: Iterable[int]) -> tuple[list[Choices], dict[str, Choices]]:
+        """Return what fixed seeds, and the race, choose by one of these parts, on average over the parts."""
+        rules = {**FIXED, RACE: RACES[RACE]}
         of_parts = [choices_of(candidates, rules, part=part, truth=-1) for part in parts]
-        return {name: Choices(*np.mean([of_part[name] for of_part in of_parts], axis=0)) for name in rules}
+        means = {name: Choices(*np.mean([of_part[name] for of_part in of_parts], axis=0)) for name in rules}
+        return [means[name] for name in FIXED], {RACE: means[RACE]}
 
-    race, blocks, whole = {RACE: RACES[RACE]}, range(N_BLOCKS), [-1]
+    by_blocks, by_all = chosen(range(N_BLOCKS)), chosen([-1])
     few, many = f"{N_EPISODES}", f"{N_BLOCKS * N_EPISODES:,}"
-    pairs = {(few, few): (blocks, blocks), (many, few): (whole, blocks), (many, many): (whole, whole)}
+    pairs = {(few, few): (by_blocks, by_blocks), (many, few): (by_all, by_blocks), (many, many): (by_all, by_all)}
     return {
-        f"the race with {mine} episodes, fixed seeds with {theirs}": compare(
-            [*chosen(FIXED, of_fixed).values()], chosen(race, of_race)
-        )[0]
-        for (mine, theirs), (of_race, of_fixed) in pairs.items()
+        f"the race with {mine} episodes, fixed seeds with {theirs}": compare(fixed, race)[0]
+        for (mine, theirs), ((_, race), (fixed, _)) in pairs.items()
     }
