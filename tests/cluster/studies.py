@@ -45,6 +45,7 @@ TRAINING = [
     *(
         "training.validation_episodes=2",
         "evaluation.episodes=3",
+        "study.final_eval.episodes=3",
         "env.max_steps=8",
         "agent.learning_starts=100",
         "tracking.policy=false",

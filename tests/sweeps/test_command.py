@@ -46,6 +46,7 @@ TINY = [
         "study.final_eval.min_seeds=1",
         "study.final_eval.mean_seeds=1",
         "study.final_eval.judge_seeds=1",
+        "study.final_eval.episodes=4",
     ),
 ]
 
@@ -94,6 +95,17 @@ def check_result(folder):
         assert {key: printed[name, key] for key in expected} == pytest.approx(expected)
 
 
+def check_values(folder, runs):
+    """Check that the value of each trial is of the episodes after its training, more of them in the selection."""
+    values = {study: [trial.value for trial in trials_of(folder, study)] for study in ("sac_y", "sac_y-selection")}
+    trained = [run for run in runs if run.data.tags.get("study") in values and "seed" in run.data.params]
+    assert len(trained) == sum(map(len, values.values()))
+    for run in trained:
+        study = run.data.tags["study"]
+        assert run.data.metrics["selection/mean_steps"] == values[study][int(run.data.tags["trial"])]
+        assert run.data.params["evaluation.episodes"] == ("3" if study == "sac_y" else "4")
+
+
 @pytest.mark.full
 @pytest.mark.usefixtures("database")
 def test_study_runs_its_trials_judges_the_best_and_goes_on_when_it_is_asked_for_more(tmp_path, monkeypatch):
@@ -110,6 +122,7 @@ def test_study_runs_its_trials_judges_the_best_and_goes_on_when_it_is_asked_for_
         assert line in ended.stdout
     check_result(tmp_path)
     client, runs = runs_in(tmp_path)
+    check_values(tmp_path, runs)
     by_id = {each.info.run_id: each for each in runs}
     assert {each.info.status for each in runs} == {"FINISHED"}
     # Only the trainings of the judgement keep their policies.
@@ -348,6 +361,7 @@ MISTAKES = [
         "study.final_eval.judge_seeds=0",
         "study.final_eval.judge_seeds is 0, but it must be a whole number from 1 to 1000",
     ),
+    ("evaluation.episodes=1001", "but final trainings must have at least as many: give also study.final_eval.episodes"),
     ("study.final_eval.n_seeds=2", "study.final_eval.n_seeds has been renamed: give study.final_eval.judge_seeds"),
     ("study.workers=999", "--plan", "study.workers is 999, but this machine has "),
     ("study.workers=999", "study.workers is 999, but this machine has "),

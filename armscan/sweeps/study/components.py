@@ -73,6 +73,11 @@ def read_settings(overrides: Sequence[str]) -> tuple[StudySettings, Task, DictCo
         if not (there := nearest_existing(Path(folder))).is_dir():
             raise StudyError(f"study.{name} is {folder!r}, but {str(there)!r} is not a folder")
     of_trials, _ = reduce_to_run(config)
+    if (n_episodes := of_trials.evaluation.episodes) > settings.final_eval.episodes:
+        raise InvalidValueError(
+            f"evaluation.episodes is {n_episodes}, but final trainings must have at least as many: give also "
+            f"study.final_eval.episodes, which is {settings.final_eval.episodes}"
+        )
     return settings, _task_of(settings, of_trials), of_trials
 
 

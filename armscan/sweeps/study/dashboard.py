@@ -67,7 +67,7 @@ def table_of_seeds(of_seeds: Mapping[int, Mapping[str, float]]) -> str:
     for name in names:
         values = (metrics.get(name, math.nan) for metrics in of_seeds.values())
         rows.append([title_of(name), *(MISSING if math.isnan(value) else value_text(name, value) for value in values)])
-    return markdown_table(["validation at the best epoch; cost in all", *(f"seed {seed}" for seed in of_seeds)], rows)
+    return markdown_table(["validation volumes; cost in all", *(f"seed {seed}" for seed in of_seeds)], rows)
 
 
 def shown_metrics(metrics: Mapping[str, float], n_seeds: int) -> dict[str, float]:

@@ -23,7 +23,7 @@ FINAL_EVAL = "final_eval"
 class _Stored(Section):
     """Settings of a final evaluation, as the study of the selection stores them; see `FinalEvaluation`."""
 
-    settings: FinalEvalSettings = Field(description="a section with top_k, min_seeds, mean_seeds and judge_seeds")
+    settings: FinalEvalSettings = Field(description="a section with the keys of study.final_eval")
     search_seed: int = Field(ge=0, le=MAX_SEARCH_SEED, description="the largest seed of the search")
     control: dict[str, Value] | None = Field(default=None, description="the values of the control by their keys")
 

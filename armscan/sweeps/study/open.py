@@ -215,6 +215,7 @@ def _final_phases(search: Phase, settings: StudySettings, task: Task, final: Fin
         reported=(),
         seeds_of=lambda trial: (training_of(trial)[1],),
         population=None,
+        overrides=(f"evaluation.episodes={settings.final_eval.episodes}",),
     )
     scheduler = partial(TrialScheduler, storage=search.scheduler.storage, limits=limits, is_current=final.is_current)
     name_objectives(final.selection, search.objectives)

@@ -47,6 +47,7 @@ class Phase:
         experiment_id: MLflow experiment ID of the tracked runs.
         run_id: MLflow run ID of the study.
         population: Population of which each trial trains a member. Default: None, trials are independent.
+        overrides: Overrides of all its trials, in addition to those of the study. Default: none.
     """
 
     name: str
@@ -64,6 +65,7 @@ class Phase:
     experiment_id: str
     run_id: str
     population: Population | None = None
+    overrides: tuple[str, ...] = ()
 
     def remove_checkpoints(self, finished: FrozenTrial | Trial) -> None:
         """Remove the last checkpoints of a finished trial and of its earlier attempts; the best ones stay.

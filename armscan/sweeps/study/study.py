@@ -42,7 +42,7 @@ from armscan.tracking import flatten
 N_SHOWN = 5
 # Instead of the value of a key that a configuration does not have.
 NOT_THERE = "not there"
-CONSTRAINTS = "study.constraints"
+CONSTRAINTS, FINAL_EPISODES = "study.constraints", "study.final_eval.episodes"
 # Among the compared settings: the size and interval of a population, the overrides below a searched group, and
 # checksums of the volumes and of the modules of own classes. A study that lacks one, as those of earlier versions do,
 # is not compared by it.
@@ -152,6 +152,8 @@ def comparable_settings(settings: StudySettings, fixed: Mapping[str, Any]) -> di
     searched, not_compared = tuple(f"{name}." for name in names), tuple(f"{key}." for key in NOT_COMPARED)
     given, sampler = fixed.get(STUDY, {}), settings.sampler
     of_trials: dict[str, Any] = {"study.seeds": list(settings.seeds), "study.task": settings.task["_target_"]}
+    # A study without it is of an earlier version, in which the value of a trial was its best validation.
+    of_trials[FINAL_EPISODES] = settings.final_eval.episodes
     if settings.constraints:
         of_trials[CONSTRAINTS] = list(map(str, settings.constraints))
     is_population = "interval_env_steps" in sampler

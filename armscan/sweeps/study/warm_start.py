@@ -42,8 +42,6 @@ PRESET, SOURCE = "preset {}", "study {}"
 N_ENQUEUED = 10
 # In `study.enqueue`: the configuration of the study itself.
 DEFAULT = "default"
-# The value of a trial does not depend on it: only final trainings have evaluations.
-FINAL_EPISODES = "evaluation.episodes"
 # User attributes that a taken trial keeps.
 KEPT = (METRICS, SEEDS, ENV_STEPS)
 
@@ -196,7 +194,7 @@ def _difference(source: optuna.Study, wanted: Mapping[str, Any]) -> str | None:
     # The values of a trial are in this order.
     if [*there[OBJECTIVES].items()] != [*wanted[OBJECTIVES].items()]:
         return f"its objectives are {' and '.join(f'{way} {name}' for name, way in there[OBJECTIVES].items())}"
-    may_differ = tuple(f"{key}." for key in (*renamed(there[SPACE]), *wanted[SPACE], FINAL_EPISODES))
+    may_differ = tuple(f"{key}." for key in (*renamed(there[SPACE]), *wanted[SPACE]))
     different = differing(*fixed_of(source, wanted))
     found = [(key, pair) for key, pair in different.items() if not f"{key}.".startswith(may_differ)]
     if not found:

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 
 from armscan.sweeps.storage.attribute_names import ENV_STEPS
 from armscan.sweeps.tasks.attempt import Attempt
-from armscan.sweeps.tasks.generation import best_of_generation, inherited
+from armscan.sweeps.tasks.generation import inherited
 from armscan.training import Budget, EpochReport, Evaluation, TrainingResult
 
-# Metrics of each training, in addition to those of its best validation.
+# Metrics of each training, in addition to those on the validation volumes.
 TRAINING_METRICS = (ENV_STEPS, "training_s", "solved")
 
 
@@ -59,12 +59,11 @@ class Reporter:
         """Report nothing: `metrics` returns the result of the training."""
 
     def metrics(self, result: TrainingResult) -> dict[str, float]:
-        """Return the metrics of a finished training, without what it has inherited from another trial."""
+        """Return `TRAINING_METRICS` of a finished training, without what it has inherited from another trial."""
         before = inherited(self.attempt, result.reports)
-        best = best_of_generation(result.reports, before, self.budget.best_by).evaluation.metrics()
         n_before, before_s = (before.n_env_steps, before.wall_s) if before is not None else (0, 0.0)
         measured = (result.reports[-1].n_env_steps - n_before, result.wall_s - before_s, float(result.is_solved))
-        return best | dict(zip(TRAINING_METRICS, measured, strict=True))
+        return dict(zip(TRAINING_METRICS, measured, strict=True))
 
     def _validation(self) -> Evaluation:
         """Return the last validation; with several objectives the best one, as if the training ended now.

@@ -33,6 +33,8 @@ class Task(Protocol):
     def run(self, attempt: Attempt) -> dict[str, float]:
         """Run a trial, or resume one, and return its metrics.
 
+        Trials are compared by these metrics, so they should not be the best of several validations.
+
         Raises:
             optuna.TrialPruned: If the trial is pruned.
         """
@@ -40,7 +42,8 @@ class Task(Protocol):
     def validate(self, attempt: Attempt) -> dict[str, float]:
         """Run a candidate with one seed, and return the metrics that `run` returns, on the validation volumes.
 
-        Candidates are compared by these metrics, so they must not be the best of several validations.
+        Candidates are compared by these metrics, so they must not be the best of several validations. The configuration
+        has `study.final_eval.episodes` as its `evaluation.episodes`, as that of `evaluate`.
         """
 
     def evaluate(self, attempt: Attempt) -> dict[str, float]:

@@ -142,7 +142,8 @@ class Worker:
         trial.study.sampler = make("sampler", phase.sampler, BaseSampler, seed=int(seed))
         # A new object each time: writes that the trial has cached may have been lost with the connection.
         chosen = phase.scheduler.storage.transaction(lambda: phase.suggest(Trial(trial.study, trial._trial_id)))
-        config, choices = compose_run([*self._overrides, *overrides_of(chosen)])
+        own = [*phase.overrides, *overrides_of(chosen)]
+        config, choices = compose_run([*self._overrides, *own])
         folder = trial_folder(phase.folder, trial.number)
         folder.mkdir(parents=True, exist_ok=True)
         config_sum = config_sha256(to_plain(config))
@@ -154,7 +155,7 @@ class Worker:
                 writes.append(partial(trial.set_user_attr, name, value))
         attempt = Attempt(
             trial=trial,
-            overrides=overrides_of(chosen),
+            overrides=own,
             composed=(config, choices),
             command=kept_command([MULTIRUN[0], *self._overrides]),
             seeds=phase.seeds_of(trial),

@@ -1,6 +1,6 @@
 """A bench for studies: which sampler, pruner and rule of seeds finds the best settings with the fewest trainings.
 
-python -m benchmarks.sweeps.bench collect sac_y [OVERRIDE ...] [--configs N] [--seeds N] [--workers N]
+python -m benchmarks.sweeps.bench collect sac_y [--configs N] [--seeds N] [--workers N]
 python -m benchmarks.sweeps.bench report sac_y [--studies N] [--workers N] [--picture FILE]
 python -m benchmarks.sweeps.bench collect-episodes sac_y [--seeds N] [--workers N]
 python -m benchmarks.sweeps.bench report-episodes sac_y [--studies N]
@@ -32,7 +32,6 @@ def main() -> None:
     commands = parser.add_subparsers(dest="command", required=True)
     collecting = commands.add_parser("collect", help="train what is missing in a table")
     collecting.add_argument("sweep", help="name of the sweep, such as sac_y")
-    collecting.add_argument("overrides", nargs="*", help="overrides of all trainings, such as evaluation.episodes=200")
     collecting.add_argument("--configs", type=count, default=300, help="configurations (default: 300)")
     collecting.add_argument("--seeds", type=count, default=8, help="trainings of each (default: 8)")
     collecting.add_argument("--workers", type=count, default=1, help="processes that train (default: 1)")
@@ -69,14 +68,7 @@ def main() -> None:
 
 def _run(given: argparse.Namespace) -> None:
     if given.command == "collect":
-        collect(
-            given.sweep,
-            given.configs,
-            given.seeds,
-            given.workers,
-            allow_changes=given.allow_changes,
-            overrides=given.overrides,
-        )
+        collect(given.sweep, given.configs, given.seeds, given.workers, allow_changes=given.allow_changes)
         return
     if given.command == "collect-episodes":
         collect_evaluations(given.sweep, given.seeds, given.workers)

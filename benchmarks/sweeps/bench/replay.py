@@ -56,7 +56,7 @@ class Candidate:
     """A trial that ran to its end.
 
     Args:
-        value: Interquartile mean over its seeds of the mean steps in the best validation.
+        value: Interquartile mean over its seeds of the mean steps in the selection.
         config: Its configuration.
         number: Number of the trial in its search, from 0.
         n_trainings: Environment steps of the search until the end of this trial, in whole trainings.
@@ -131,16 +131,15 @@ def search(
 def _run(trial: Trial, config: SimulatedConfig, n_seeds: int, rng: np.random.Generator) -> tuple[float | None, float]:
     """Return the value of a trial, None if it was pruned, and its environment steps; see `Attempt.report`."""
     env_steps = config.surrogate.env_steps
-    total, best = env_steps[-1], []
+    total, values = env_steps[-1], []
     for seed in range(n_seeds):
-        curve = config.train(rng).curve
-        for n_env_steps, steps in zip(env_steps, curve, strict=True):
-            trial.report(float(np.mean([*best, steps])), int(seed * total + n_env_steps))
+        training = config.train(rng)
+        for n_env_steps, steps in zip(env_steps, training.curve, strict=True):
+            trial.report(float(np.mean([*values, steps])), int(seed * total + n_env_steps))
             if trial.should_prune():
                 return None, seed * total + n_env_steps
-        # The fewest steps stand for the best validation: success rates hardly ever choose another.
-        best.append(float(curve.min()))
-    return float(interquartile_mean(np.array(best))), n_seeds * total
+        values.append(training.selection)
+    return float(interquartile_mean(np.array(values))), n_seeds * total
 
 
 class Choice(NamedTuple):

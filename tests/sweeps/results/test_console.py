@@ -14,7 +14,7 @@ from armscan.sweeps.study.settings import FinalEvalSettings
 
 @pytest.fixture
 def study(opened):
-    return opened(final_eval=FinalEvalSettings(top_k=1, min_seeds=1, mean_seeds=1, judge_seeds=1))
+    return opened(final_eval=FinalEvalSettings(top_k=1, min_seeds=1, mean_seeds=1, judge_seeds=1, episodes=3))
 
 
 @pytest.fixture
@@ -34,7 +34,9 @@ def test_study_whose_workers_have_ended_before_its_trials_can_be_resumed(study, 
 
 
 def test_limit_that_ended_the_search_is_named(opened, capsys):
-    study = opened(max_env_steps=100, final_eval=FinalEvalSettings(top_k=0, min_seeds=1, mean_seeds=1, judge_seeds=1))
+    study = opened(
+        max_env_steps=100, final_eval=FinalEvalSettings(top_k=0, min_seeds=1, mean_seeds=1, judge_seeds=1, episodes=3)
+    )
     trial = study.search.scheduler.claim({})
     trial.set_user_attr(ENV_STEPS, 120)
     study.search.scheduler.study.tell(trial, 1.0)

@@ -21,7 +21,7 @@ METRICS = {
 
 def test_table_of_seeds_is_rounded_and_called_as_people_call_it():
     assert table_of_seeds({0: METRICS, 7: METRICS}).splitlines() == [
-        "| validation at the best epoch; cost in all | seed 0 | seed 7 |",
+        "| validation volumes; cost in all | seed 0 | seed 7 |",
         "| --- | ---: | ---: |",
         "| on plane, 5 mm 10° | 93.8% | 93.8% |",
         "| distance mm, median | 1.2 | 1.2 |",

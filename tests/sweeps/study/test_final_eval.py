@@ -35,7 +35,7 @@ from armscan.sweeps.study.study import make_study
 from tests.sweeps.conftest import fail
 from tests.sweeps.study.test_study import settings
 
-FINAL_EVAL = {"top_k": 2, "min_seeds": 2, "mean_seeds": 4, "judge_seeds": 3}
+FINAL_EVAL = {"top_k": 2, "min_seeds": 2, "mean_seeds": 4, "judge_seeds": 3, "episodes": 9}
 # Mean steps of each configuration on all volumes: the luckiest trial of the search is not the best.
 TRUE = {CONTROL: 6.0, 0: 5.0, 1: 3.0, 2: 9.0}
 LUCK = {0: 1.0, 1: 2.0, 2: 9.0}
@@ -355,7 +355,7 @@ def test_note_on_a_study_says_which_settings_how_sure_and_what_helps(storage_uri
 
 
 def test_one_judge_seed_gives_a_difference_without_interval_and_the_result_says_so(storage_uri):
-    final = run(storage_uri, judge_seeds=1)
+    final = run(storage_uri, judge_seeds=1, episodes=3)
     said, *_, table, _, _ = result_note(judge(final)).split("\n\n")
     assert said == "**Trial 1 was chosen; one seed does not show whether it is better than the control.**"
     first = table.splitlines()[2].split("|")
@@ -403,7 +403,8 @@ def test_latest_trial_of_each_member_is_trained_with_its_whole_schedule(storage_
 
 
 def test_settings_of_an_earlier_version_are_read():
-    assert FinalEvalSettings.read("a", FINAL_EVAL | {"n_seeds": 7}).judge_seeds == 7
+    before = {"top_k": 2, "min_seeds": 2, "mean_seeds": 4, "n_seeds": 7}
+    assert FinalEvalSettings.read("a", before).model_dump() == FINAL_EVAL | {"judge_seeds": 7, "episodes": 200}
 
 
 def test_nothing_is_left_of_a_final_evaluation_whose_trainings_all_failed(storage_uri):

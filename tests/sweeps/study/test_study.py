@@ -14,7 +14,7 @@ from armscan.sweeps.study.arguments import StudyCommand, trial_overrides
 from armscan.sweeps.study.components import read_settings
 from armscan.sweeps.study.final_eval_storage import open_final_eval
 from armscan.sweeps.study.settings import FinalEvalSettings, StudySettings
-from armscan.sweeps.study.study import LATER, best_trials, change_notes, existing_study, make_study
+from armscan.sweeps.study.study import FINAL_EPISODES, LATER, best_trials, change_notes, existing_study, make_study
 
 FIXED = {"agent": {"lr": 1e-3, "gamma": 0.9}, "seed": 3, "device": "cpu", "tracking": {"uri": "a"}}
 
@@ -39,7 +39,7 @@ def settings(**changes):
         "workers": 1,
         "seed": 0,
         "seeds": (0,),
-        "final_eval": FinalEvalSettings(top_k=0, min_seeds=1, mean_seeds=1, judge_seeds=1),
+        "final_eval": FinalEvalSettings(top_k=0, min_seeds=1, mean_seeds=1, judge_seeds=1, episodes=3),
         "allow_config_changes": False,
     }
     return StudySettings(**values | changes)
@@ -199,7 +199,7 @@ def test_change_of_a_configuration_is_noted_with_the_trials_that_had_the_earlier
 def test_study_of_an_earlier_version_goes_on_with_the_names_of_this_one(storage_uri):
     storage, lr = open_storage(storage_uri), {"low": 1e-4, "high": 1e-2}
     before = {"env._target_": "armscan.envs.EnvMaker", "agent.random_env_steps": 2000}
-    before |= {"study.seeds": [0], "study.task": "armscan.sweeps.training.Training"}
+    before |= {"study.seeds": [0], "study.task": "armscan.sweeps.training.Training", FINAL_EPISODES: 3}
     study = optuna.create_study(study_name="a", storage=storage.optuna)
     study.set_user_attr("space", Space.read({"agent.updates_per_env_step": lr}).to_plain())
     study.set_user_attr("objectives", {"mean_steps": "minimize"})
@@ -208,7 +208,7 @@ def test_study_of_an_earlier_version_goes_on_with_the_names_of_this_one(storage_
     ratio = trial.suggest_float("agent.updates_per_env_step", **lr)
     study.tell(trial, 1.0)
     fixed = {"env": {"_target_": "armscan.envs.EnvFactory"}, "agent": {"learning_starts": 2000}}
-    final_eval = FinalEvalSettings(top_k=1, min_seeds=1, mean_seeds=1, judge_seeds=1)
+    final_eval = FinalEvalSettings(top_k=1, min_seeds=1, mean_seeds=1, judge_seeds=1, episodes=3)
     now = settings(space=Space.read({"agent.utd_ratio": lr}), final_eval=final_eval)
     search = make_study(storage, now, fixed)
     control, best = open_final_eval(storage, now, search, None).missing_of_selection()

@@ -17,7 +17,7 @@ from armscan.sweeps.study.arguments import StudyCommand, trial_overrides
 from armscan.sweeps.study.components import read_settings
 from armscan.sweeps.study.final_eval_storage import open_final_eval
 from armscan.sweeps.study.settings import FinalEvalSettings
-from armscan.sweeps.study.study import best_trials, make_study
+from armscan.sweeps.study.study import FINAL_EPISODES, best_trials, make_study
 from armscan.sweeps.study.warm_start import N_ENQUEUED, InitialTrials, initial_trials, values_of
 from tests.sweeps.study.test_study import settings
 
@@ -77,11 +77,12 @@ def test_trials_of_the_same_configuration_are_taken_with_their_values_and_count_
     assert scheduler.claim({"worker": "a"}).number == 2
 
 
-def test_trials_with_fewer_episodes_in_final_evaluations_are_taken_with_their_values(study_in):
-    fixed, before = ({"evaluation": {"episodes": n_episodes}} for n_episodes in (1000, 200))
-    study_in("before", {"agent.lr": LR}, FIXED | before, rows=[({"agent.lr": 1e-3}, 3.0)])
-    (message,) = begin(study_in("after", {"agent.lr": LR}, FIXED | fixed, warm_start=["before"]), FIXED | fixed)
-    assert message.endswith("1 taken with their values")
+def test_values_of_earlier_versions_are_not_taken_because_they_were_best_validations(study_in):
+    _, _, source = study_in("before", {"agent.lr": LR}, FIXED, rows=[({"agent.lr": 1e-3}, 3.0)])
+    stored = {key: value for key, value in source.user_attrs["fixed_config"].items() if key != FINAL_EPISODES}
+    source.set_user_attr("fixed_config", stored)
+    (message,) = begin(study_in("after", {"agent.lr": LR}, FIXED, warm_start=["before"]))
+    assert f"none taken with its value, because its {FINAL_EPISODES} is not there" in message
 
 
 def test_edited_space_takes_what_fits(study_in):
@@ -187,7 +188,7 @@ def test_taken_trial_with_the_values_of_the_control_is_no_candidate_beside_it(st
     control, misfit = values_of(Space.read(space), words)
     assert (control, misfit) == ({"agent.lr": 2e-3, "stack": 1}, None)
     study_in("before", space, rows=[(control, 1.0), (control | {"stack": 4}, 2.0)])
-    final_eval = FinalEvalSettings(top_k=2, min_seeds=1, mean_seeds=1, judge_seeds=1)
+    final_eval = FinalEvalSettings(top_k=2, min_seeds=1, mean_seeds=1, judge_seeds=1, episodes=3)
     asked, storage, study = made = study_in("now", space, warm_start=["before"], final_eval=final_eval)
     begin(made)
     assert open_final_eval(storage, asked, study, None).contenders() == [CONTROL, 0, 1]

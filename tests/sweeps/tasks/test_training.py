@@ -17,7 +17,7 @@ from tests.support import FEW_VOLUMES
 @pytest.mark.parametrize("interval", [None, (0, 400)], ids=["whole", "generation"])
 def test_seed_of_an_earlier_attempt_is_trained_again_for_the_next_generation(tmp_path, monkeypatch, interval):
     trained, adopted = [], []
-    monkeypatch.setattr(training, "_train", lambda attempt, seed: trained.append(seed) or {"mean_steps": 1.0})
+    monkeypatch.setattr(training, "_train", lambda attempt, seed, conclude: trained.append(seed) or {"mean_steps": 1.0})
     monkeypatch.setattr(training, "adopt", lambda attempt, seed: adopted.append(seed))
     attempt = SimpleNamespace(seeds=(0, 1), seeds_done={0: {"mean_steps": 2.0}}, folder=tmp_path, interval=interval)
     attempt.keep_seed = attempt.seeds_done.__setitem__
@@ -47,7 +47,7 @@ def test_run_of_a_generation_whose_parent_left_nothing_fails_with_that_reason(tm
         seeds_done={},
     )
     with pytest.raises(CheckpointError, match="the next generation needs"):
-        _train(attempt, 0)
+        _train(attempt, 0, None)
     run = client.get_run(opened[0].run_id)
     assert run.info.status == "FAILED"
     assert "the next generation needs" in run.data.tags["failure"]
