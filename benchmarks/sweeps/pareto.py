@@ -30,7 +30,7 @@ from armscan.sweeps.storage.attribute_names import ENV_STEPS
 from armscan.sweeps.storage.reports import REPORT, reports_of, store_report
 from armscan.sweeps.study.pruners import ParetoPruner
 from benchmarks.arguments import add_options_of, call, parser_of
-from benchmarks.sweeps.bench.table import VALIDATION, read_rows, table_file
+from benchmarks.sweeps.bench.table import SELECTION, VALIDATION, read_rows, table_file
 from benchmarks.sweeps.studies import run_study
 
 WORDS = ("projection=y", "training.env_steps=8000", "training.eval_every_env_steps=1000")
@@ -77,14 +77,14 @@ def sac_y() -> Unpruned:
     """Return the trainings of the table of `sac_y`, each as a trial of two objectives."""
     rows = read_rows(table_file("sac_y"))
     trials = []
-    for _, training in rows[rows.volumes == VALIDATION].groupby(["config", "seed"]):
-        ordered = training.sort_values("env_steps")
+    for _, training in rows.groupby(["config", "seed"]):
+        ordered = training[training.volumes == VALIDATION].sort_values("env_steps")
         best = accumulate(ordered.mean_steps, min)
         reports = {
             int(step): [so_far, seconds]
             for step, so_far, seconds in zip(ordered.env_steps, best, ordered.processor_s, strict=True)
         }
-        values = list(reports.values())[-1]
+        values = [training[training.volumes == SELECTION].mean_steps.item(), ordered.processor_s.iloc[-1]]
         of_reports = {f"{REPORT}{step}": report for step, report in reports.items()}
         trials.append(create_trial(values=values, system_attrs=of_reports, user_attrs={ENV_STEPS: max(reports)}))
     return Unpruned("sac_y (mean steps, processor seconds)", (StudyDirection.MINIMIZE,) * 2, 2500, trials)
