@@ -200,7 +200,8 @@ def _difference(source: optuna.Study, wanted: Mapping[str, Any]) -> str | None:
     if not found:
         return None
     key, (then, today) = found[0]
-    return f"its {key} is {then}, and not {today}" + (f" ({len(found) - 1} others differ)" if len(found) > 1 else "")
+    more = f" ({counted(len(found) - 1, 'further difference')})" if len(found) > 1 else ""
+    return f"its {key} is {then}, and not {today}{more}"
 
 
 def _is_opposed(source: optuna.Study, wanted: Mapping[str, Any]) -> bool:
