@@ -67,6 +67,7 @@ def print_dataset(dataset: Dataset, folder: Path) -> None:
 
 
 def _plane_of(volume: LabelVolume) -> str:
+    from armscan.anatomy import PIXEL_TISSUES, SUCCESS_THRESHOLD, LandmarkReward, PlaneScorer, is_coarse
     from armscan.envs.scene import reachable_optimum
     from armscan.volumes.labelmap import LANDMARKS, TISSUE_LABELS
 
@@ -76,7 +77,13 @@ def _plane_of(volume: LabelVolume) -> str:
         return f"{LABELLED} that misses the volume"
     labels = volume.slice(plane)
     missing = [tissue for tissue in LANDMARKS if TISSUE_LABELS[tissue] not in labels]
-    return LABELLED + (f" that shows no {listed(missing)}" if missing else "")
+    if missing:
+        return f"{LABELLED} that shows no {listed(missing)}"
+    score, _ = PlaneScorer(volume, LandmarkReward(), PIXEL_TISSUES).score(plane)
+    # Scores of coarse pixels say little.
+    if score > -SUCCESS_THRESHOLD or is_coarse(volume.pixel_mm):
+        return LABELLED
+    return f"{LABELLED} that scores {score:.3f}, and an environment requires more than {-SUCCESS_THRESHOLD:g}"
 
 
 def _coarse_note(volume: LabelVolume) -> list[str]:
