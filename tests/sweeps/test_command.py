@@ -378,7 +378,7 @@ MISTAKES = [
         "study.space: agent.tau=7.0 is not allowed: agent.tau is 7.0, but it must be",
     ),
     ("study.space={agent.lr:{choices:[1]}}", "study.space.agent.lr.choices=[...] on the command line replaces a range"),
-    ("study.space.seed.choices=[1,2]", "study.space.seed: 'seed' says how a study is run"),
+    ("study.space.seed.choices=[1,2]", "study.space.seed: 'seed' sets how a study is run"),
     (
         "study.space.network.choices=[auto,mlp]",
         "study.space.network.vector.hidden_sizes.choices=[[8]]",

@@ -44,9 +44,9 @@ class Limits(Section):
     def limit_reason(self, state: StudyState) -> str | None:
         """Return which limit, time or environment steps, is reached and stops running trials; None if neither is."""
         if self.timeout_hours is not None and state.busy_hours >= self.timeout_hours:
-            return f"the {self.timeout_hours:g} hours of study.timeout_hours are over"
+            return f"study.timeout_hours, {self.timeout_hours:g}, has been reached"
         if self.max_env_steps is not None and state.env_steps >= self.max_env_steps:
-            return f"the {self.max_env_steps} environment steps of study.max_env_steps are taken"
+            return f"study.max_env_steps, {self.max_env_steps}, has been reached"
         return None
 
     def failure_reason(self, state: StudyState, failed: Sequence[FrozenTrial]) -> str | None:

@@ -37,8 +37,8 @@ def read_settings(overrides: Sequence[str]) -> tuple[StudySettings, Task, DictCo
     config = compose(overrides, return_hydra_config=True)
     if config.get(SWEEP) is not None:
         raise InvalidValueError(
-            f"what {SWEEP}= names sets only the section {SWEEP} of the configuration: its file must begin with the "
-            "line '# @package _global_'"
+            f"the file that {SWEEP}= names sets only the section {SWEEP} of the configuration: its first line must be "
+            "'# @package _global_'"
         )
     section = to_plain(config.study) if config.get("study") is not None else {}
     # The command sets it for each worker.

@@ -114,8 +114,8 @@ def _print_cost(
         f"{state.env_steps:,} environment steps, {spent_mib:.0f} MiB"
     )
     console.print(
-        f"the rest   {counted(n_left, 'trial')} and the final evaluation, about {least:.2f} to {most:.2f} hours; the "
-        f"trials alone {spent_mib / len(state.finished) * n_left:.0f} MiB ({mean_s:.0f} s a trial so far)"
+        f"the rest   {counted(n_left, 'trial')} and the final evaluation, about {least:.2f} to {most:.2f} hours; "
+        f"the trials alone {spent_mib / len(state.finished) * n_left:.0f} MiB ({mean_s:.0f} s a trial so far)"
         if most
         else "the rest   nothing: the study has finished"
     )

@@ -42,7 +42,7 @@ def test_limit_that_ended_the_search_is_named(opened, capsys):
     study.search.scheduler.study.tell(trial, 1.0)
     assert print_result(study) == 0
     printed = capsys.readouterr().out
-    assert "the search has ended: the 100 environment steps of study.max_env_steps are taken" in printed
+    assert "the search has ended: study.max_env_steps, 100, has been reached" in printed
 
 
 def test_study_whose_final_trainings_are_missing_can_be_resumed(searched, capsys):

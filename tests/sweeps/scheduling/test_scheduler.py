@@ -93,12 +93,12 @@ def test_limits_of_time_and_environment_steps_end_a_study(make_scheduler):
     assert scheduler.end_reason(scheduler.state()) is None
     # A retry begins with the seeds that its trial had finished.
     scheduler.claim({}).set_user_attr("seeds", {"0": {"env_steps": 1}})
-    assert scheduler.end_reason(scheduler.state()) == "the 100 environment steps of study.max_env_steps are taken"
+    assert scheduler.end_reason(scheduler.state()) == "study.max_env_steps, 100, has been reached"
     assert make_scheduler(timeout_hours=1.0).end_reason(scheduler.state()) is None
     time.sleep(0.1)
     assert (
         make_scheduler(timeout_hours=1e-5).end_reason(scheduler.state())
-        == "the 1e-05 hours of study.timeout_hours are over"
+        == "study.timeout_hours, 1e-05, has been reached"
     )
 
 
@@ -367,7 +367,7 @@ def test_requeued_trial_keeps_the_time_of_its_end_and_the_limit_stays_reached(ma
     time.sleep(0.05)
     scheduler.requeue(trial, {})
     reason = scheduler.limits.limit_reason(scheduler.state())
-    assert reason == "the 1e-05 hours of study.timeout_hours are over"
+    assert reason == "study.timeout_hours, 1e-05, has been reached"
     spent_h = scheduler.state().busy_hours
     time.sleep(0.05)
     assert scheduler.state().busy_hours == spent_h
