@@ -16,10 +16,11 @@ from armscan.sweeps.storage.storage import existing_storage
 from armscan.sweeps.study.arguments import STORAGE, StudyCommand, trial_overrides
 from armscan.sweeps.study.components import check_space, read_settings
 from armscan.sweeps.study.final_eval_storage import stored_final_eval
+from armscan.sweeps.study.fixed_config import fixed_config
 from armscan.sweeps.study.open import open_for_work
 from armscan.sweeps.study.plan import print_plan
 from armscan.sweeps.study.population import population_of
-from armscan.sweeps.study.study import existing_study, fixed_config, is_reconfigured
+from armscan.sweeps.study.study import existing_study, is_reconfigured
 from armscan.sweeps.study.warm_start import initial_trials
 from armscan.sweeps.tasks.attempt import volume_sums, volumes_of
 from armscan.sweeps.workers.launch import run_workers

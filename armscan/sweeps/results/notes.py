@@ -8,7 +8,7 @@ import optuna
 
 from armscan.sweeps.scheduling.state import FINISHED
 from armscan.sweeps.storage.attribute_names import CODE, LEASE
-from armscan.sweeps.study.study import change_notes
+from armscan.sweeps.study.fixed_config import change_notes
 
 
 def notes_on(study: optuna.Study) -> list[str]:

@@ -35,12 +35,13 @@ from armscan.sweeps.storage.attribute_names import (
 )
 from armscan.sweeps.study.candidates import attributes_of, settings_of, training_of
 from armscan.sweeps.study.constraints import Constraint
+from armscan.sweeps.study.fixed_config import CONSTRAINTS
 from armscan.sweeps.study.settings import (
     JUDGEMENT_SEEDS_ABOVE,
     SELECTION_SEEDS_ABOVE,
     FinalEvalSettings,
 )
-from armscan.sweeps.study.study import CONSTRAINTS, best_trials
+from armscan.sweeps.study.study import best_trials
 from armscan.utils.files import sha256
 
 ENDED_WITHOUT_SCORE = (TrialState.FAIL, TrialState.PRUNED)

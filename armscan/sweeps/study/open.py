@@ -26,10 +26,11 @@ from armscan.sweeps.study.constraints import constrained
 from armscan.sweeps.study.dashboard import note_run
 from armscan.sweeps.study.final_eval import FinalEvaluation
 from armscan.sweeps.study.final_eval_storage import open_final_eval
+from armscan.sweeps.study.fixed_config import fixed_config
 from armscan.sweeps.study.phase import OpenedStudy, Phase
 from armscan.sweeps.study.population import population_of
 from armscan.sweeps.study.settings import StudySettings
-from armscan.sweeps.study.study import fixed_config, make_study, name_objectives
+from armscan.sweeps.study.study import make_study, name_objectives
 from armscan.sweeps.study.terminators import Terminator
 from armscan.sweeps.study.warm_start import values_of
 from armscan.sweeps.tasks.task import Task

@@ -5,23 +5,17 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
 from typing import Any
 
 import optuna
-from omegaconf import DictConfig
 from optuna.exceptions import ExperimentalWarning
 from optuna.pruners import BasePruner
 from optuna.trial import FrozenTrial, TrialState
 
-from armscan.config.defaults import ADDED, NOT_COMPARED, to_plain
-from armscan.config.legacy import migrate, renamed
-from armscan.config.own_code import own_code
-from armscan.config.trust import classes_in_groups
-from armscan.errors import StudyError, few
+from armscan.config.legacy import renamed
+from armscan.errors import StudyError
 from armscan.sweeps.scheduling.population import searched_values
 from armscan.sweeps.scheduling.state import is_feasible, loss_signs
-from armscan.sweeps.space.parameter import hydra_literal
 from armscan.sweeps.space.space import is_conditional
 from armscan.sweeps.storage.attribute_names import (
     EARLIER_CONFIGS,
@@ -34,19 +28,9 @@ from armscan.sweeps.storage.attribute_names import (
 )
 from armscan.sweeps.storage.attributes import StudyAttributes, check_trials
 from armscan.sweeps.storage.storage import Storage
-from armscan.sweeps.study.arguments import STUDY, fixed_by
 from armscan.sweeps.study.components import make
+from armscan.sweeps.study.fixed_config import CONSTRAINTS, VOLUMES, comparable_settings, fixed_of, listed_differences
 from armscan.sweeps.study.settings import StudySettings
-from armscan.tracking import flatten
-
-N_SHOWN = 5
-# Instead of the value of a key that a configuration does not have.
-NOT_THERE = "not there"
-CONSTRAINTS, FINAL_EPISODES = "study.constraints", "study.final_eval.episodes"
-# Among the compared settings: the size and interval of a population, the overrides below a searched group, and
-# checksums of the volumes and of the modules of own classes. A study that lacks one, as those of earlier versions do,
-# is not compared by it.
-LATER = POPULATION, OVERRIDES, VOLUMES, CODE = "study.population", "study.overrides", "study.volumes", "study.code"
 
 
 def make_study(storage: Storage, settings: StudySettings, fixed: Mapping[str, Any]) -> optuna.Study:
@@ -133,94 +117,6 @@ def _lacks_settings(study: optuna.Study, wanted: Mapping[str, Any]) -> bool:
     return not study.user_attrs.keys() >= wanted.keys() and not study.get_trials(deepcopy=False)
 
 
-def fixed_config(
-    config: DictConfig, overrides: Sequence[str], volumes: Mapping[str, str] | None = None
-) -> dict[str, Any]:
-    """Return the configuration of a study's trials, their overrides and volumes; see `comparable_settings`.
-
-    Args:
-        config: Configuration of its trials without the searched values.
-        overrides: Overrides that its trials are composed from.
-        volumes: Checksums of the volumes; see `volume_sums`. Default: None, they are not compared.
-    """
-    return to_plain(config) | {STUDY: {"overrides": fixed_by(overrides), "volumes": volumes or {}}}
-
-
-def comparable_settings(settings: StudySettings, fixed: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings that a study stores, which are compared when it is started again."""
-    names = [each.name for each in settings.space.parameters]
-    searched, not_compared = tuple(f"{name}." for name in names), tuple(f"{key}." for key in NOT_COMPARED)
-    given, sampler = fixed.get(STUDY, {}), settings.sampler
-    of_trials: dict[str, Any] = {"study.seeds": list(settings.seeds), "study.task": settings.task["_target_"]}
-    # A study without it is of an earlier version, in which the value of a trial was its best validation.
-    of_trials[FINAL_EPISODES] = settings.final_eval.episodes
-    if settings.constraints:
-        of_trials[CONSTRAINTS] = list(map(str, settings.constraints))
-    is_population = "interval_env_steps" in sampler
-    of_trials[POPULATION] = [sampler.get("population"), sampler["interval_env_steps"]] if is_population else None
-    # A trial chooses all other keys of a searched group.
-    of_trials[OVERRIDES] = [
-        f"{key}={hydra_literal(value)}"
-        for key, value in sorted(given.get("overrides", {}).items())
-        if f"{key}.".startswith(searched) and not f"{key}.".startswith(not_compared)
-    ]
-    if not any(f"{name}.".startswith("data.") for name in names):
-        of_trials |= {f"{VOLUMES}.{part}": volumes for part, volumes in given.get("volumes", {}).items()}
-    code = own_code(
-        {**fixed, "task": settings.task},
-        classes_in_groups({each.name: each.extremes for each in settings.space.parameters}),
-    )
-    of_trials |= {f"{CODE}.{module}": checksum for module, checksum in code.items()}
-    left_out = (*not_compared, *searched, f"{STUDY}.")
-    shared = {key: value for key, value in flatten(fixed).items() if not f"{key}.".startswith(left_out)}
-    shared = {key: value for key, value in shared.items() if key not in ADDED or value is not None}
-    return {
-        SPACE: settings.space.to_plain(),
-        OBJECTIVES: dict(settings.objectives),
-        FIXED: shared | of_trials,
-    }
-
-
-def fixed_of(study: optuna.Study, wanted: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the fixed configuration of a stored study, and the wanted one, without what only one of them compares."""
-    there = migrate(study.user_attrs.get(FIXED, {}))
-    trials = study.get_trials(deepcopy=False)
-    if POPULATION not in there and trials and not any(MEMBER in trial.user_attrs for trial in trials):
-        there[POPULATION] = None
-    return _comparable(there, wanted[FIXED])
-
-
-def differing(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
-    """Return the values that differ between two fixed configurations; `NOT_THERE` for a key that one does not have."""
-    pairs = {key: (before.get(key, NOT_THERE), now.get(key, NOT_THERE)) for key in {**before, **now}}
-    return {key: (then, today) for key, (then, today) in pairs.items() if then != today}
-
-
-def _comparable(before: Mapping[str, Any], now: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return two fixed configurations without what only one of them compares."""
-    alone = {key for key in before.keys() ^ now.keys() if key.startswith(LATER)}
-    before, now = ({key: each[key] for key in each if key not in alone} for each in (before, now))
-    return before, now
-
-
-def config_changes(study: optuna.Study) -> dict[int, str]:
-    """Return how the configuration changed while a study ran, by the number of the first trial after each change."""
-    earlier = sorted((int(number), config) for number, config in study.user_attrs.get(EARLIER_CONFIGS, {}).items())
-    configs = [migrate(config) for config in (*(config for _, config in earlier), study.user_attrs.get(FIXED, {}))]
-    found = {
-        number: _differences(*_comparable(*pair)) for (number, _), pair in zip(earlier, pairwise(configs), strict=True)
-    }
-    return {number: differences for number, differences in found.items() if differences}
-
-
-def change_notes(study: optuna.Study) -> list[str]:
-    """Return a note on each change of a study's configuration."""
-    return [
-        f"trials before {number} had another configuration ({differences}), so their values do not compare with others"
-        for number, differences in config_changes(study).items()
-    ]
-
-
 def is_ours(study: optuna.Study) -> bool:
     """Return whether armscan made a study, and not another program in the same storage.
 
@@ -243,26 +139,22 @@ def _check_same(settings: StudySettings, study: optuna.Study, wanted: Mapping[st
     whose = f"the study {settings.name} in {settings.storage if '://' not in settings.storage else 'its storage'}"
     other = "; give study.name another value"
     for key, what in ((SPACE, "searches another space"), (OBJECTIVES, "has other objectives")):
-        if differences := _differences(renamed(there.get(key, {})), wanted[key]):
+        if differences := listed_differences(renamed(there.get(key, {})), wanted[key]):
             raise StudyError(f"{whose} {what}: {differences}{other}")
     # The values of its trials are in this order.
     if [*there[OBJECTIVES]] != [*wanted[OBJECTIVES]]:
         raise StudyError(f"{whose} has its objectives in another order: {', '.join(there[OBJECTIVES])}{other}")
     before, now = fixed_of(study, wanted)
-    if differences := _differences(*({CONSTRAINTS: each.get(CONSTRAINTS, [])} for each in (before, now))):
+    if differences := listed_differences(*({CONSTRAINTS: each.get(CONSTRAINTS, [])} for each in (before, now))):
         # Whether a trial keeps them was stored when it finished.
         raise StudyError(f"{whose} has other constraints: {differences}{other}")
-    differences = _differences(before, now)
+    differences = listed_differences(before, now)
     if differences and not settings.allow_config_changes:
         raise StudyError(
             f"{whose} was started with another configuration: {differences}; accept that with "
             f"study.allow_config_changes=true, or give study.name another value"
         )
     return bool(differences)
-
-
-def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    return few([f"{key} was {then}, is {today}" for key, (then, today) in differing(before, now).items()], N_SHOWN)
 
 
 def best_trials(study: optuna.Study, n_best: int) -> list[FrozenTrial]:

@@ -33,8 +33,9 @@ from armscan.sweeps.storage.attribute_names import (
 from armscan.sweeps.storage.attributes import FINAL_SUFFIXES, check_trials
 from armscan.sweeps.storage.reports import REPORT
 from armscan.sweeps.storage.storage import Storage, existing_storage
+from armscan.sweeps.study.fixed_config import comparable_settings, config_changes, differing, fixed_of
 from armscan.sweeps.study.settings import StudySettings
-from armscan.sweeps.study.study import best_trials, comparable_settings, config_changes, differing, fixed_of, is_ours
+from armscan.sweeps.study.study import best_trials, is_ours
 from armscan.utils.text import counted
 
 PRESET, SOURCE = "preset {}", "study {}"

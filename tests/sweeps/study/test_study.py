@@ -13,8 +13,9 @@ from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.arguments import StudyCommand, trial_overrides
 from armscan.sweeps.study.components import read_settings
 from armscan.sweeps.study.final_eval_storage import open_final_eval
+from armscan.sweeps.study.fixed_config import FINAL_EPISODES, LATER, change_notes
 from armscan.sweeps.study.settings import FinalEvalSettings, StudySettings
-from armscan.sweeps.study.study import FINAL_EPISODES, LATER, best_trials, change_notes, existing_study, make_study
+from armscan.sweeps.study.study import best_trials, existing_study, make_study
 
 FIXED = {"agent": {"lr": 1e-3, "gamma": 0.9}, "seed": 3, "device": "cpu", "tracking": {"uri": "a"}}
 

@@ -16,8 +16,9 @@ from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.arguments import StudyCommand, trial_overrides
 from armscan.sweeps.study.components import read_settings
 from armscan.sweeps.study.final_eval_storage import open_final_eval
+from armscan.sweeps.study.fixed_config import FINAL_EPISODES
 from armscan.sweeps.study.settings import FinalEvalSettings
-from armscan.sweeps.study.study import FINAL_EPISODES, best_trials, make_study
+from armscan.sweeps.study.study import best_trials, make_study
 from armscan.sweeps.study.warm_start import N_ENQUEUED, InitialTrials, initial_trials, values_of
 from tests.sweeps.study.test_study import settings
 
