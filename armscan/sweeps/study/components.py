@@ -73,7 +73,8 @@ def read_settings(overrides: Sequence[str]) -> tuple[StudySettings, Task, DictCo
         if not (there := nearest_existing(Path(folder))).is_dir():
             raise StudyError(f"study.{name} is {folder!r}, but {str(there)!r} is not a folder")
     of_trials, _ = reduce_to_run(config)
-    if (n_episodes := of_trials.evaluation.episodes) > settings.final_eval.episodes:
+    n_episodes, has_finals = of_trials.evaluation.episodes, settings.final_eval.top_k > 0
+    if has_finals and n_episodes > settings.final_eval.episodes:
         raise InvalidValueError(
             f"evaluation.episodes is {n_episodes}, but final trainings must have at least as many: give also "
             f"study.final_eval.episodes, which is {settings.final_eval.episodes}"
