@@ -35,7 +35,7 @@ ADDED = ("training.schedule",)
 # Of a cross-validation: the number of folds, and the fold that a run is tested on.
 FOLDS, FOLD = "data.folds", "data.fold"
 # Prefixes of keys that a study does not search.
-NOT_SEARCHED = ("study", "sweep", "tracking", "hydra", "seed")
+NOT_SEARCHED = ("study", "sweep", "tracking", "evaluation", "hydra", "seed")
 TRACKING_FILE = "tracking/mlflow.yaml"
 # Stands for phantoms where a command takes a folder of volumes.
 PHANTOM = "phantom"

@@ -31,20 +31,26 @@ from armscan.utils.files import atomic_write
 from armscan.utils.run_files import BASELINES_FILE, EVALUATION_FILE, RESULTS_PAGE
 from armscan.utils.text import PERCENT, counted, formatted
 
-LAST_VALIDATION, BEST_VALIDATION = "last validation", "best validation"
+LAST_VALIDATION, BEST_VALIDATION, NEW_EPISODES = "last validation", "best validation", "new validation episodes"
 AGENT = "agent"
 TITLES = {
     TEST: "agent, test",
     VALIDATION: "agent, validation",
     LAST_VALIDATION: f"agent, {LAST_VALIDATION}",
     BEST_VALIDATION: f"agent, {BEST_VALIDATION}",
+    NEW_EPISODES: f"agent, {NEW_EPISODES}",
     TRAINING: "agent, training",
 }
 # Every evaluation tracks this metric, below the name of its group; `NAMES` maps groups to the names of their volumes.
 EVALUATED = "/success_rate"
 # Of the metrics of a single volume in an evaluation.
 VOLUME_PREFIX = "volume/"
-NAMES = {metric_prefix(name): name for name in (TEST, TRAINING)} | {"validation": LAST_VALIDATION}
+NAMES = {metric_prefix(name): name for name in (TEST, TRAINING)} | {
+    "validation": LAST_VALIDATION,
+    "selection": NEW_EPISODES,
+}
+# Groups of metrics that are no evaluation, or that a trial also has by the names of runs.
+LEFT_OUT = ("train", "test")
 
 
 @dataclass(frozen=True)
@@ -156,7 +162,7 @@ def figures_of(metrics: Mapping[str, float]) -> dict[str, MetricEstimates]:
     return {
         NAMES.get(group, group.replace("_", " ")): figures
         for group, figures in _by_group(metrics).items()
-        if "/" not in group and group != "train"
+        if "/" not in group and group not in LEFT_OUT
     }
 
 

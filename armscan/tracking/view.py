@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 
 from armscan.stats.on_plane import ON_PLANE
-from armscan.tracking.tags import VALIDATION_PREFIX
+from armscan.tracking.tags import SELECTION_PREFIX, VALIDATION_PREFIX
 
 VIEW_KEY = "armscan"
 VIEW_TAG = f"mlflow.sharedViewState.{VIEW_KEY}"
@@ -50,7 +50,12 @@ def _line(metric: str, title: str) -> dict[str, object]:
 def _columns() -> dict[str, int]:
     """Return the columns in their order, each with its width in pixels."""
     leading, *others = (f"test_volumes/{name}" for name in FIGURES)
-    metrics = [leading, f"random/{LEADING}", *others, f"{VALIDATION_PREFIX}{LEADING}"]
+    metrics = [
+        leading,
+        f"random/{LEADING}",
+        *others,
+        *(f"{prefix}{LEADING}" for prefix in (SELECTION_PREFIX, VALIDATION_PREFIX)),
+    ]
     return {
         **{f"metrics.`{name}`": LETTER_PX * len(name) + AROUND_PX for name in metrics},
         "params.`seed`": 80,

@@ -220,7 +220,15 @@ def test_show_tells_everything_of_a_run(make_run, store, answer, tmp_path):
     assert re.search("^command +python -m armscan.run agent=sac", answer("show", run_id)[1], re.MULTILINE)
 
 
-def test_show_of_a_study_is_its_result_and_of_a_trial_its_best_epoch(make_run, answer):
+def test_show_of_a_trial_names_its_new_validation_episodes_and_does_not_call_them_a_test(make_run, answer):
+    figures = {"selection/success_rate": 0.75, "selection/mean_steps": 9.25, "test/mean_steps": 3.0}
+    shown = answer("show", make_run("trial 2", figures=figures, tags={"study": "s", "trial": "2"}))[1]
+    assert "new validation" in shown
+    assert re.search(r"success.*75\.0%", " ".join(shown.split()))
+    assert "test" not in shown.partition("figures")[2].partition("folder")[0]
+
+
+def test_show_of_a_study_is_its_result_and_of_a_member_of_a_population_its_best_epoch(make_run, answer):
     figures = {"validation/success_rate": 0.75, "validation/seeds": 3.0, "probability_of_improvement/success_rate": 0.2}
     result = "**Trial 2 is better.**\n\n| metric | chosen |\n| --- | --- |\n| steps, \x1b[2Jmean | 2.50 |"
     tags = {"study": "s", "mlflow.note.content": result, DESCRIPTION_SUM_TAG: sha256(result.encode())}

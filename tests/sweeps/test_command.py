@@ -361,7 +361,10 @@ MISTAKES = [
         "study.final_eval.judge_seeds=0",
         "study.final_eval.judge_seeds is 0, but it must be a whole number from 1 to 1000",
     ),
-    ("evaluation.episodes=1001", "but final trainings must have at least as many: give also study.final_eval.episodes"),
+    (
+        "evaluation.episodes=1001",
+        "evaluation.episodes is 1001, but final trainings must have at least as many: give also study.final_eval",
+    ),
     ("study.final_eval.n_seeds=2", "study.final_eval.n_seeds has been renamed: give study.final_eval.judge_seeds"),
     ("study.workers=999", "--plan", "study.workers is 999, but this machine has "),
     ("study.workers=999", "study.workers is 999, but this machine has "),
@@ -427,5 +430,5 @@ def test_study_answers_a_file_that_is_not_for_the_whole_configuration(tmp_path, 
     monkeypatch.chdir(tmp_path)
     (tmp_path / "sweeps").mkdir()
     (tmp_path / "sweeps" / "mine.yaml").write_text("study: {name: mine}\n")
-    with pytest.raises(InvalidValueError, match="its file must begin with the line '# @package _global_'"):
+    with pytest.raises(InvalidValueError, match="its first line must be '# @package _global_'"):
         run_study(["-m", "sweep=mine"], launch=pytest.fail)

@@ -14,6 +14,7 @@ from armscan.sweeps.results.final_results import ConfigResult, final_results
 from armscan.sweeps.results.notes import code_notes, notes_on
 from armscan.sweeps.scheduling.state import CONTROL
 from armscan.sweeps.space.parameter import overrides_of
+from armscan.sweeps.storage.attribute_names import OF_CONFIG
 from armscan.sweeps.study.candidates import name_of, settings_of, training_of
 from armscan.sweeps.study.final_eval import FinalEvaluation, to_judge
 from armscan.training.baselines import RANDOM
@@ -161,7 +162,12 @@ def judge(final: FinalEvaluation) -> Judgement | None:
         settings={name_of(each.number): " ".join(overrides_of(settings_of(searched, each.number))) for each in results},
         n_unjudged=final.n_unjudged,
         violated={number: each for number, each in final.violated().items() if number in race.standings},
-        is_repeated=not all(map(final.is_current, complete)),
+        # Those of the first version have no checksum, and other seeds.
+        is_repeated=any(
+            not final.is_current(trial)
+            or (OF_CONFIG not in trial.user_attrs and training_of(trial)[1] not in final.judge_seeds)
+            for trial in complete
+        ),
         changes=[
             *notes_on(final.search),
             *code_notes(final.selection, "the trainings of the selection"),

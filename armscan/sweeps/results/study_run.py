@@ -6,14 +6,16 @@ import math
 from collections.abc import Mapping
 
 import optuna
+from optuna.trial import FrozenTrial
 
 from armscan.sweeps.results.difference import HOW
 from armscan.sweeps.results.final_results import final_table
 from armscan.sweeps.results.judgement import Judgement
 from armscan.sweeps.scheduling.state import CONTROL
-from armscan.sweeps.storage.attribute_names import METRICS, OBJECTIVES
+from armscan.sweeps.storage.attribute_names import MEMBER, METRICS, OBJECTIVES
 from armscan.sweeps.study.candidates import NOTHING_SEARCHED
 from armscan.sweeps.study.study import best_trials
+from armscan.tracking.tags import SELECTION_PREFIX, VALIDATION_PREFIX
 from armscan.training.baselines import RANDOM
 from armscan.training.episode_results import TEST_METRICS
 from armscan.training.metric_display import leading_among
@@ -35,13 +37,12 @@ def best_metrics(search: optuna.Study, judgement: Judgement | None) -> dict[str,
         judgement: Its judgement; None without one.
     """
     best = best_trials(search, 1)
-    found = _leading("validation", best[0].user_attrs.get(METRICS, {}) if best else {})
+    found = _of_search(best[0]) if best else {}
     if judgement is None or (chosen := judgement.of_chosen) is None:
         return found
     found = dict.fromkeys(found, math.nan)
     if judgement.chosen != CONTROL:
-        trials = search.get_trials(deepcopy=False)
-        found |= _leading("validation", trials[judgement.chosen].user_attrs.get(METRICS, {}))
+        found |= _of_search(search.get_trials(deepcopy=False)[judgement.chosen])
     of_chosen = chosen.figures.metrics()
     found |= _leading(TEST_METRICS, of_chosen)
     if (of_random := chosen.baselines.get(RANDOM)) is not None:
@@ -52,6 +53,12 @@ def best_metrics(search: optuna.Study, judgement: Judgement | None) -> dict[str,
         for key, estimate in zip(COMPARISONS, (each.estimate, each.probability), strict=True):
             found |= dict(zip(_names(key, each.metric), estimate, strict=True))
     return found
+
+
+def _of_search(trial: FrozenTrial) -> dict[str, float]:
+    """Return the leading metrics that gave a trial of the search its value."""
+    prefix = VALIDATION_PREFIX if MEMBER in trial.user_attrs else SELECTION_PREFIX
+    return _leading(prefix.removesuffix("/"), trial.user_attrs.get(METRICS, {}))
 
 
 def _leading(prefix: str, metrics: Mapping[str, float]) -> dict[str, float]:

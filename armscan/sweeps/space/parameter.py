@@ -82,7 +82,9 @@ class Parameter:
         if not KEY.fullmatch(name):
             raise InvalidValueError(f"{where}: {name!r} is not a key of the configuration, such as agent.lr")
         if re.split("[/.]", name)[0] in NOT_SEARCHED:
-            raise InvalidValueError(f"{where}: {name!r} sets how a study is run or stored, so it cannot be searched")
+            raise InvalidValueError(
+                f"{where}: {name!r} sets how a study is run, evaluated or stored, so it cannot be searched"
+            )
         if not isinstance(described, Mapping) or ("choices" in described) is bool({"low", "high"} & described.keys()):
             raise InvalidValueError(
                 f"{where} is {described!r}, but it must have low and high, or choices: {where}.choices=[...] on the "

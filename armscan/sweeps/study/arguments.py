@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -20,6 +20,7 @@ from armscan.errors import InvalidValueError
 from armscan.experiment.build import check_config
 from armscan.experiment.effects import check_effects
 from armscan.launch.launchers import LAUNCHER
+from armscan.sweeps.space.parameter import hydra_literal
 
 STUDY = "study"
 TASK_TARGET, TRAINING_TASK = "study.task._target_", "armscan.sweeps.tasks.training.TrainingTask"
@@ -54,7 +55,7 @@ class StudyCommand:
             raise InvalidValueError("study is a section of the configuration: give its keys, such as study.n_trials=40")
         for override in parsed:
             _check(override)
-        return cls(tuple(map(_merging, overrides)), PLAN in arguments)
+        return cls(tuple(_with_one_space(overrides)), PLAN in arguments)
 
     @property
     def launching(self) -> list[str]:
@@ -92,6 +93,20 @@ def check_training_overrides(arguments: Sequence[str]) -> None:
 def fixed_by(overrides: Sequence[str]) -> dict[str, Any]:
     """Return the values that overrides give to keys and groups of the configuration."""
     return {each.key_or_group: each.value() for each in OverridesParser.create().parse_overrides(list(overrides))}
+
+
+def _with_one_space(overrides: Sequence[str]) -> list[str]:
+    """Return overrides with at most one of the study's space: of several, Hydra's launcher keeps the last alone."""
+    others = [each for each in overrides if SPACE_OVERRIDE.fullmatch(each) is None]
+    changes = [_merging(each) for each in overrides if SPACE_OVERRIDE.fullmatch(each)]
+    if len(changes) < 2:
+        return [*others, *changes]
+    merged: dict[str, Any] = {}
+    for change in changes:
+        for key, described in fixed_by([change])[SPACE].items():
+            is_part = isinstance(described, Mapping) and isinstance(merged.get(key), Mapping)
+            merged[key] = {**merged[key], **described} if is_part else described
+    return [*others, f"++{SPACE}={hydra_literal(merged)}"]
 
 
 def _merging(override: str) -> str:

@@ -10,7 +10,7 @@ from typing import Any
 import optuna
 from hydra.errors import HydraException, InstantiationException
 from hydra.utils import instantiate
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from optuna.pruners import BasePruner
 from optuna.samplers import BaseSampler
@@ -25,11 +25,13 @@ from armscan.sweeps.space.parameter import Value, overrides_of
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.study.arguments import fixed_by
 from armscan.sweeps.study.samplers import CmaEsSampler
-from armscan.sweeps.study.settings import StudySettings
+from armscan.sweeps.study.settings import FinalEvalSettings, StudySettings
 from armscan.sweeps.study.terminators import Terminator
 from armscan.sweeps.tasks.task import Task
 from armscan.utils.files import nearest_existing
 from armscan.utils.validation import missing_members
+
+EPISODES_KEY = "evaluation.episodes"
 
 
 def read_settings(overrides: Sequence[str]) -> tuple[StudySettings, Task, DictConfig]:
@@ -73,12 +75,6 @@ def read_settings(overrides: Sequence[str]) -> tuple[StudySettings, Task, DictCo
         if not (there := nearest_existing(Path(folder))).is_dir():
             raise StudyError(f"study.{name} is {folder!r}, but {str(there)!r} is not a folder")
     of_trials, _ = reduce_to_run(config)
-    n_episodes, has_finals = of_trials.evaluation.episodes, settings.final_eval.top_k > 0
-    if has_finals and n_episodes > settings.final_eval.episodes:
-        raise InvalidValueError(
-            f"evaluation.episodes is {n_episodes}, but final trainings must have at least as many: give also "
-            f"study.final_eval.episodes, which is {settings.final_eval.episodes}"
-        )
     return settings, _task_of(settings, of_trials), of_trials
 
 
@@ -157,9 +153,26 @@ def check_space(settings: StudySettings, task: Task, overrides: Sequence[str], c
         with _named(chosen):
             compose_run([*overrides, *overrides_of(chosen)])
     task.check(config)
+    _check_final_episodes(settings.final_eval, OmegaConf.select(config, EPISODES_KEY))
     for chosen in (*tried, *map(settings.space.completed, whole)):
         with _named(chosen):
             task.check(compose_run([*overrides, *overrides_of(chosen)])[0])
+
+
+def _check_final_episodes(final: FinalEvalSettings, n_of_trials: int | None) -> None:
+    """Check that final trainings have as many episodes as trials, or more."""
+    if not final.top_k or final.episodes is None:
+        return
+    if n_of_trials is None:
+        raise InvalidValueError(
+            f"study.final_eval.episodes is {final.episodes}, but the configuration has no {EPISODES_KEY}: give "
+            "study.final_eval.episodes=null"
+        )
+    if n_of_trials > final.episodes:
+        raise InvalidValueError(
+            f"{EPISODES_KEY} is {n_of_trials}, but final trainings must have at least as many: give also "
+            f"study.final_eval.episodes, which is {final.episodes}"
+        )
 
 
 @contextmanager

@@ -90,8 +90,8 @@ def named_as_of_runs(metrics: Mapping[str, float], n_seeds: int, prefix: str) ->
     Args:
         metrics: Metrics of the trial, those on the test volumes by names of their own.
         n_seeds: Number of its seeds.
-        prefix: Prefix of the metrics on the validation volumes: `validation/`, or `selection/` in the race over seeds,
-            which has episodes of its own.
+        prefix: Prefix of the metrics on the validation volumes: `selection/`, or `validation/` in a population, whose
+            trials play no new episodes.
     """
     of_phases = {prefix: metrics, f"{TEST_METRICS}/": metrics_of_test(metrics)}
     named = {f"{of}{name}": each[name] for of, each in of_phases.items() for name in leading_among(each)}

@@ -16,14 +16,18 @@ from armscan.config.trust import classes_in_groups
 from armscan.errors import few
 from armscan.sweeps.space.parameter import hydra_literal
 from armscan.sweeps.storage.attribute_names import EARLIER_CONFIGS, FIXED, MEMBER, OBJECTIVES, SPACE
-from armscan.sweeps.study.arguments import STUDY, fixed_by
+from armscan.sweeps.study.arguments import STUDY, TRAINING_TASK, fixed_by
 from armscan.sweeps.study.settings import StudySettings
 from armscan.tracking import flatten
 
 N_SHOWN = 5
 # Instead of the value of a key that a configuration does not have.
 NOT_THERE = "not there"
-CONSTRAINTS, FINAL_EPISODES = "study.constraints", "study.final_eval.episodes"
+CONSTRAINTS = "study.constraints"
+# No trial of the search depends on it: it is stored because final trainings with another number begin anew.
+FINAL_EPISODES = "study.final_eval.episodes"
+# What gives a trial its value. A study without it is of an earlier version, in which it was the best validation.
+TRIAL_VALUE, NEW_EPISODES, BEST_VALIDATION = "study.trial_value", "new episodes", "best validation"
 # Among the compared settings: the size and interval of a population, the overrides below a searched group, and
 # checksums of the volumes and of the modules of own classes. A study that lacks one, as those of earlier versions do,
 # is not compared by it.
@@ -49,11 +53,12 @@ def comparable_settings(settings: StudySettings, fixed: Mapping[str, Any]) -> di
     searched, not_compared = tuple(f"{name}." for name in names), tuple(f"{key}." for key in NOT_COMPARED)
     given, sampler = fixed.get(STUDY, {}), settings.sampler
     of_trials: dict[str, Any] = {"study.seeds": list(settings.seeds), "study.task": settings.task["_target_"]}
-    # A study without it is of an earlier version, in which the value of a trial was its best validation.
     of_trials[FINAL_EPISODES] = settings.final_eval.episodes
     if settings.constraints:
         of_trials[CONSTRAINTS] = list(map(str, settings.constraints))
     is_population = "interval_env_steps" in sampler
+    if settings.task["_target_"] == TRAINING_TASK and not is_population:
+        of_trials[TRIAL_VALUE] = NEW_EPISODES
     of_trials[POPULATION] = [sampler.get("population"), sampler["interval_env_steps"]] if is_population else None
     # A trial chooses all other keys of a searched group.
     of_trials[OVERRIDES] = [
@@ -94,9 +99,11 @@ def differing(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, tu
 
 
 def _comparable(before: Mapping[str, Any], now: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return two fixed configurations without what only one of them compares."""
-    alone = {key for key in before.keys() ^ now.keys() if key.startswith(LATER)}
-    before, now = ({key: each[key] for key in each if key not in alone} for each in (before, now))
+    """Return two fixed configurations without what only one of them compares, and what no trial depends on."""
+    if TRIAL_VALUE in now:
+        before = {TRIAL_VALUE: BEST_VALIDATION, **before}
+    left_out = {FINAL_EPISODES, *(key for key in before.keys() ^ now.keys() if key.startswith(LATER))}
+    before, now = ({key: each[key] for key in each if key not in left_out} for each in (before, now))
     return before, now
 
 

@@ -21,7 +21,7 @@ from armscan.sweeps.scheduling.termination import Termination
 from armscan.sweeps.storage.attribute_names import BEGUN_IN, STUDY_RUN
 from armscan.sweeps.storage.storage import Storage, open_storage
 from armscan.sweeps.study.candidates import training_of
-from armscan.sweeps.study.components import make_as
+from armscan.sweeps.study.components import EPISODES_KEY, make_as
 from armscan.sweeps.study.constraints import constrained
 from armscan.sweeps.study.dashboard import note_run
 from armscan.sweeps.study.final_eval import FinalEvaluation
@@ -216,7 +216,7 @@ def _final_phases(search: Phase, settings: StudySettings, task: Task, final: Fin
         reported=(),
         seeds_of=lambda trial: (training_of(trial)[1],),
         population=None,
-        overrides=(f"evaluation.episodes={settings.final_eval.episodes}",),
+        overrides=() if (n := settings.final_eval.episodes) is None else (f"{EPISODES_KEY}={n}",),
     )
     scheduler = partial(TrialScheduler, storage=search.scheduler.storage, limits=limits, is_current=final.is_current)
     name_objectives(final.selection, search.objectives)

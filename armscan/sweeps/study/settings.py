@@ -25,8 +25,6 @@ NAME = re.compile(rf"(?!.*(?:{'|'.join(FINAL_SUFFIXES)})$)\w[\w\-.]{{0,99}}")
 # number of seeds of a configuration in each.
 SELECTION_SEEDS_ABOVE, JUDGEMENT_SEEDS_ABOVE, MAX_FINAL_SEEDS = 1000, 2000, 1000
 MAX_SEARCH_SEED = MAX_SEED - JUDGEMENT_SEEDS_ABOVE - MAX_FINAL_SEEDS
-# Episodes of a final training in studies of earlier versions, which stored no number.
-EARLIER_EPISODES = 200
 T = TypeVar("T")
 OPTUNA_PRUNERS = "optuna.pruners."
 NO_PRUNER = f"{OPTUNA_PRUNERS}NopPruner"
@@ -103,25 +101,24 @@ class FinalEvalSettings(Section):
             the best get more than others, but at most four times this number.
         judge_seeds: Number of seeds of the chosen configuration, and of the control, on the test volumes, from 1 to
             1000.
-        episodes: Number of episodes of each evaluation of a final training, 1 or more.
+        episodes: Number of episodes of each evaluation of a final training, 1 or more. Default: None, as many as
+            `evaluation.episodes`.
     """
 
     top_k: int = Field(ge=0, description="a whole number of at least 0")
     min_seeds: MeanSeeds
     mean_seeds: MeanSeeds
     judge_seeds: SeedCount
-    episodes: Positive
+    episodes: int | None = Field(default=None, ge=1, description="a whole number of at least 1, or null")
 
     @model_validator(mode="before")
     @classmethod
     def _of_earlier_versions(cls, values: Any) -> Any:
-        """Take `n_seeds` of a sweep of an earlier version as `judge_seeds`, and add `episodes`, which that lacks."""
-        if not isinstance(values, Mapping):
+        """Take `n_seeds` of a sweep that was written for an earlier version as `judge_seeds`."""
+        if not isinstance(values, Mapping) or "n_seeds" not in values:
             return values
-        kept = {"episodes": EARLIER_EPISODES, **values}
-        if "n_seeds" in kept:
-            kept["judge_seeds"] = kept.pop("n_seeds")
-        return kept
+        kept = {key: value for key, value in values.items() if key != "n_seeds"}
+        return kept | {"judge_seeds": values["n_seeds"]}
 
     @model_validator(mode="after")
     def _fewest_first(self) -> Self:

@@ -24,12 +24,20 @@ from armscan.sweeps.storage.attribute_names import (
     MEMBER,
     OBJECTIVES,
     OF_STUDY,
+    SEEDS,
     SPACE,
 )
 from armscan.sweeps.storage.attributes import StudyAttributes, check_trials
 from armscan.sweeps.storage.storage import Storage
 from armscan.sweeps.study.components import make
-from armscan.sweeps.study.fixed_config import CONSTRAINTS, VOLUMES, comparable_settings, fixed_of, listed_differences
+from armscan.sweeps.study.fixed_config import (
+    CONSTRAINTS,
+    FINAL_EPISODES,
+    VOLUMES,
+    comparable_settings,
+    fixed_of,
+    listed_differences,
+)
 from armscan.sweeps.study.settings import StudySettings
 
 
@@ -69,8 +77,13 @@ def make_study(storage: Storage, settings: StudySettings, fixed: Mapping[str, An
 
 def _reconfigure(study: optuna.Study, wanted: Mapping[str, Any]) -> None:
     """Store another configuration for the trials to come, and the one of the trials until now."""
-    there, n_trials = study.user_attrs, len(study.get_trials(deepcopy=False))
-    if n_trials:
+    there, trials = study.user_attrs, study.get_trials(deepcopy=False)
+    if listed_differences(*fixed_of(study, {FIXED: wanted})):
+        # The value of a trial is over seeds of one configuration.
+        for trial in trials:
+            if not trial.state.is_finished() and trial.user_attrs.get(SEEDS):
+                study._storage.set_trial_user_attr(trial._trial_id, SEEDS, {})
+    if n_trials := len(trials):
         # Two changes without a trial between them are one.
         study.set_user_attr(EARLIER_CONFIGS, {str(n_trials): there[FIXED]} | there.get(EARLIER_CONFIGS, {}))
     # The volumes are known to the command alone, not to its workers.
@@ -131,7 +144,7 @@ def is_ours(study: optuna.Study) -> bool:
 
 
 def _check_same(settings: StudySettings, study: optuna.Study, wanted: Mapping[str, Any]) -> bool:
-    """Return whether a study's trials have another configuration; raise if the settings do not allow that."""
+    """Return whether a study's configuration is another one; raise if the settings do not allow that of its trials."""
     there = study.user_attrs
     if not is_ours(study):
         raise StudyError(f"study.name is {settings.name!r}, but that study in its storage was not made by armscan")
@@ -154,7 +167,7 @@ def _check_same(settings: StudySettings, study: optuna.Study, wanted: Mapping[st
             f"{whose} was started with another configuration: {differences}; accept that with "
             f"study.allow_config_changes=true, or give study.name another value"
         )
-    return bool(differences)
+    return bool(differences) or there[FIXED].get(FINAL_EPISODES) != wanted[FIXED][FINAL_EPISODES]
 
 
 def best_trials(study: optuna.Study, n_best: int) -> list[FrozenTrial]:

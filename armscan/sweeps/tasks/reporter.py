@@ -66,7 +66,7 @@ class Reporter:
         return dict(zip(TRAINING_METRICS, measured, strict=True))
 
     def _validation(self) -> Evaluation:
-        """Return the last validation; with several objectives the best one, as if the training ended now.
+        """Return the last validation; with several objectives the best one, whose weights the training would end with.
 
         Pruners of one objective take the best report themselves.
         """

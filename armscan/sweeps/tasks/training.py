@@ -127,10 +127,7 @@ def _evaluate_on_validation(
 def _evaluate_on_test(
     attempt: Attempt, setup: RunSetup, result: TrainingResult, tracked: TrackedRun, folder: Path
 ) -> dict[str, float]:
-    """Evaluate a trained agent and the baselines, and store the results; return the metrics on the test volumes.
-
-    The metrics of the best validation are beside them.
-    """
+    """Evaluate a trained agent and the baselines, and store the results; return the metrics on the test volumes."""
     reached = RunResult.of(setup, result)
     keep_results(tracked, result, reached, folder)
     tested = reached.evaluations[TEST]
@@ -142,8 +139,7 @@ def _evaluate_on_test(
     from armscan.policies.build import save_policy
 
     save_policy(agent, setup.test_env, tracked, folder, log, slice_px=setup.smallest_slice_px)
-    metrics = result.best.evaluation.metrics()
-    metrics |= {f"{TEST_PREFIX}{name}": value for name, value in tested.metrics().items()}
+    metrics = {f"{TEST_PREFIX}{name}": value for name, value in tested.metrics().items()}
     for volume, evaluation in tested.by_volume().items():
         metrics |= {f"{TEST_PREFIX}volume/{volume}/{name}": value for name, value in evaluation.metrics().items()}
     return metrics

@@ -11,7 +11,6 @@ from optuna.trial import FrozenTrial, Trial, TrialState
 from armscan.sweeps.scheduling.claim import PendingWrites
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.attribute_names import METRICS, RETRY_OF, RUN
-from armscan.sweeps.storage.attributes import SELECTION_SUFFIX
 from armscan.sweeps.study.dashboard import named_as_of_runs, note_run
 from armscan.sweeps.study.phase import Phase
 from armscan.sweeps.tasks.folders import trial_folder
@@ -96,7 +95,7 @@ def end_run(
         metrics: Its metrics; empty if it was pruned or has failed.
         reason: Why it has failed. Default: None, it has not.
     """
-    prefix = SELECTION_PREFIX if phase.name.endswith(SELECTION_SUFFIX) else VALIDATION_PREFIX
+    prefix = SELECTION_PREFIX if phase.population is None else VALIDATION_PREFIX
     named = named_as_of_runs(metrics, len(phase.seeds_of(trial)), prefix)
     tracked.log_metrics({**metrics, **named}, n_env_steps=0)
     if state == TrialState.PRUNED:

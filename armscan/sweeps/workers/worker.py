@@ -142,7 +142,7 @@ class Worker:
         trial.study.sampler = make("sampler", phase.sampler, BaseSampler, seed=int(seed))
         # A new object each time: writes that the trial has cached may have been lost with the connection.
         chosen = phase.scheduler.storage.transaction(lambda: phase.suggest(Trial(trial.study, trial._trial_id)))
-        own = [*phase.overrides, *overrides_of(chosen)]
+        own = [*overrides_of(chosen), *phase.overrides]
         config, choices = compose_run([*self._overrides, *own])
         folder = trial_folder(phase.folder, trial.number)
         folder.mkdir(parents=True, exist_ok=True)

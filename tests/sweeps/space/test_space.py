@@ -112,7 +112,10 @@ def test_space_extremes_are_only_such_as_a_trial_can_have(when):
         ({"a": {"choices": [1, 1]}}, "study.space.a.choices is [1, 1], but it must be a list of values, none of them"),
         ({"a": {"choices": [1], "low": 1}}, "'low': 1}, but it must have low and high, or choices: study.space.a.cho"),
         ({"a": {"choices": [1], "log": 1}}, "there is no key 'log' in study.space.a, but only when or choices"),
-        ({"study.seed": {"choices": [1]}}, "study.space.study.seed: 'study.seed' sets how a study is run or stored"),
+        (
+            {"study.seed": {"choices": [1]}},
+            "study.space.study.seed: 'study.seed' sets how a study is run, evaluated or stored",
+        ),
         ({"a": {"low": 1, "high": 2, "max": 1}}, "there is no key 'max' in study.space.a, but only when, low, high"),
         ({"a": {"low": 2, "high": 1}}, "study.space.a: `low <= high` must hold, but got (low=2, high=1)"),
         ({"a": {"low": "x", "high": 1}}, "study.space.a.low is 'x', but it must be a finite number"),

@@ -325,8 +325,8 @@ def test_run_of_a_study_that_goes_on_until_the_control_wins_keeps_no_difference(
     judged = judge(run(storage_uri, true=TRUE | worse))
     assert (judged.chosen, judged.others) == (CONTROL, (1,))
     after = best_metrics(search, judged)
-    invalid = [name for name in before if name.startswith((*COMPARISONS, "validation/"))]
-    assert {"difference/mean_steps_low", "validation/mean_steps"} <= {*invalid}
+    invalid = [name for name in before if name.startswith((*COMPARISONS, "selection/"))]
+    assert {"difference/mean_steps_low", "selection/mean_steps"} <= {*invalid}
     assert all(math.isnan(after[name]) for name in invalid)
 
 
@@ -334,8 +334,8 @@ def test_run_of_the_study_has_the_result(storage_uri):
     final = run(storage_uri)
     judged = judge(final)
     metrics = best_metrics(final.search, judged)
-    assert best_metrics(final.search, None) == {"validation/mean_steps": 1.0, "validation/success_rate": 0.5}
-    assert metrics["validation/mean_steps"] == final.search.trials[judged.chosen].user_attrs[METRICS]["mean_steps"] > 1
+    assert best_metrics(final.search, None) == {"selection/mean_steps": 1.0, "selection/success_rate": 0.5}
+    assert metrics["selection/mean_steps"] == final.search.trials[judged.chosen].user_attrs[METRICS]["mean_steps"] > 1
     assert metrics["difference/mean_steps_low"] < metrics["difference/mean_steps"] < 0
     assert metrics["probability_of_improvement/mean_steps"] == 1.0
     assert metrics["test_volumes/mean_steps"] < 4.0
@@ -404,7 +404,7 @@ def test_latest_trial_of_each_member_is_trained_with_its_whole_schedule(storage_
 
 def test_settings_of_an_earlier_version_are_read():
     before = {"top_k": 2, "min_seeds": 2, "mean_seeds": 4, "n_seeds": 7}
-    assert FinalEvalSettings.read("a", before).model_dump() == FINAL_EVAL | {"judge_seeds": 7, "episodes": 200}
+    assert FinalEvalSettings.read("a", before).model_dump() == FINAL_EVAL | {"judge_seeds": 7, "episodes": None}
 
 
 def test_nothing_is_left_of_a_final_evaluation_whose_trainings_all_failed(storage_uri):

@@ -9,13 +9,14 @@ import pytest
 
 from armscan.errors import InvalidValueError, StudyError
 from armscan.sweeps.space.space import Space
+from armscan.sweeps.storage.attribute_names import SEEDS
 from armscan.sweeps.storage.storage import open_storage
-from armscan.sweeps.study.arguments import StudyCommand, trial_overrides
+from armscan.sweeps.study.arguments import SPACE_OVERRIDE, StudyCommand, trial_overrides
 from armscan.sweeps.study.components import read_settings
 from armscan.sweeps.study.final_eval_storage import open_final_eval
-from armscan.sweeps.study.fixed_config import FINAL_EPISODES, LATER, change_notes
+from armscan.sweeps.study.fixed_config import LATER, TRIAL_VALUE, change_notes
 from armscan.sweeps.study.settings import FinalEvalSettings, StudySettings
-from armscan.sweeps.study.study import best_trials, existing_study, make_study
+from armscan.sweeps.study.study import best_trials, existing_study, is_reconfigured, make_study
 
 FIXED = {"agent": {"lr": 1e-3, "gamma": 0.9}, "seed": 3, "device": "cpu", "tracking": {"uri": "a"}}
 
@@ -200,7 +201,7 @@ def test_change_of_a_configuration_is_noted_with_the_trials_that_had_the_earlier
 def test_study_of_an_earlier_version_goes_on_with_the_names_of_this_one(storage_uri):
     storage, lr = open_storage(storage_uri), {"low": 1e-4, "high": 1e-2}
     before = {"env._target_": "armscan.envs.EnvMaker", "agent.random_env_steps": 2000}
-    before |= {"study.seeds": [0], "study.task": "armscan.sweeps.training.Training", FINAL_EPISODES: 3}
+    before |= {"study.seeds": [0], "study.task": "armscan.sweeps.training.Training", TRIAL_VALUE: "new episodes"}
     study = optuna.create_study(study_name="a", storage=storage.optuna)
     study.set_user_attr("space", Space.read({"agent.updates_per_env_step": lr}).to_plain())
     study.set_user_attr("objectives", {"mean_steps": "minimize"})
@@ -216,6 +217,34 @@ def test_study_of_an_earlier_version_goes_on_with_the_names_of_this_one(storage_
     assert (control.params, best.params) == ({}, {"agent.utd_ratio": ratio})
 
 
+def test_changed_configuration_drops_finished_seeds_of_an_interrupted_trial(storage_uri):
+    storage = open_storage(storage_uri)
+    study = make_study(storage, settings(), FIXED)
+    study.tell(study.ask(), 1.0)
+    trial = study.ask()
+    trial.set_user_attr(SEEDS, {"0": {"mean_steps": 1.0}})
+    more = settings(final_eval=FinalEvalSettings(top_k=0, min_seeds=1, mean_seeds=1, judge_seeds=1, episodes=7))
+    # No trial of the search depends on the episodes of final trainings.
+    assert is_reconfigured(study, more, FIXED)
+    study = make_study(storage, more, FIXED)
+    assert (change_notes(study), study.trials[1].user_attrs[SEEDS]) == ([], {"0": {"mean_steps": 1.0}})
+    study = make_study(storage, settings(allow_config_changes=True), FIXED | {"stack": 4})
+    assert len(change_notes(study)) == 1
+    assert study.trials[1].user_attrs[SEEDS] == {}
+
+
+def test_value_of_a_study_that_was_begun_before_was_its_best_validation(storage_uri):
+    storage = open_storage(storage_uri)
+    study = make_study(storage, settings(), FIXED)
+    study.tell(study.ask(), 1.0)
+    earlier = {key: value for key, value in study.user_attrs["fixed_config"].items() if key != TRIAL_VALUE}
+    study.set_user_attr("fixed_config", earlier)
+    with pytest.raises(StudyError, match=r"study\.trial_value was best validation, is new episodes; accept that with"):
+        make_study(storage, settings(), FIXED)
+    (note,) = change_notes(make_study(storage, settings(allow_config_changes=True), FIXED))
+    assert "trials before 1 had another configuration (study.trial_value was best validation, is new episodes)" in note
+
+
 def test_space_is_changed_key_by_key_on_the_command_line():
     words = [
         *("-m", "sweep=sac_y", "study.space.agent.lr.high=0.5", "study.space.agent.gamma=null"),
@@ -224,7 +253,10 @@ def test_space_is_changed_key_by_key_on_the_command_line():
         *("study.space.network.vector.hidden_sizes.choices=[[8]]", "agent.target_entropy_per_dim=-1"),
         "study.space.network.vector.hidden_sizes.when={network: auto}",
     ]
-    settings, _, _ = read_settings(trial_overrides(StudyCommand.read(words).overrides))
+    overrides = trial_overrides(StudyCommand.read(words).overrides)
+    # Of several with the same key, Hydra's launcher passes on the last alone.
+    assert sum(SPACE_OVERRIDE.fullmatch(each.lstrip("+")) is not None for each in overrides) == 1
+    settings, _, _ = read_settings(overrides)
     assert settings.space == Space.read(
         {
             "agent.lr": {"low": 1e-4, "high": 0.5, "log": True},

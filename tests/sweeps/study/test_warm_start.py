@@ -16,7 +16,7 @@ from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.arguments import StudyCommand, trial_overrides
 from armscan.sweeps.study.components import read_settings
 from armscan.sweeps.study.final_eval_storage import open_final_eval
-from armscan.sweeps.study.fixed_config import FINAL_EPISODES
+from armscan.sweeps.study.fixed_config import TRIAL_VALUE
 from armscan.sweeps.study.settings import FinalEvalSettings
 from armscan.sweeps.study.study import best_trials, make_study
 from armscan.sweeps.study.warm_start import N_ENQUEUED, InitialTrials, initial_trials, values_of
@@ -80,10 +80,17 @@ def test_trials_of_the_same_configuration_are_taken_with_their_values_and_count_
 
 def test_values_of_earlier_versions_are_not_taken_because_they_were_best_validations(study_in):
     _, _, source = study_in("before", {"agent.lr": LR}, FIXED, rows=[({"agent.lr": 1e-3}, 3.0)])
-    stored = {key: value for key, value in source.user_attrs["fixed_config"].items() if key != FINAL_EPISODES}
+    stored = {key: value for key, value in source.user_attrs["fixed_config"].items() if key != TRIAL_VALUE}
     source.set_user_attr("fixed_config", stored)
     (message,) = begin(study_in("after", {"agent.lr": LR}, FIXED, warm_start=["before"]))
-    assert f"none taken with its value, because its {FINAL_EPISODES} is not there" in message
+    assert f"none taken with its value, because its {TRIAL_VALUE} is best validation, and not new episodes" in message
+
+
+def test_trials_with_fewer_episodes_in_final_trainings_are_taken_with_their_values(study_in):
+    study_in("before", {"agent.lr": LR}, FIXED, rows=[({"agent.lr": 1e-3}, 3.0)])
+    final_eval = FinalEvalSettings(top_k=0, min_seeds=1, mean_seeds=1, judge_seeds=1, episodes=7)
+    (message,) = begin(study_in("after", {"agent.lr": LR}, FIXED, warm_start=["before"], final_eval=final_eval))
+    assert message.endswith("1 taken with their values")
 
 
 def test_edited_space_takes_what_fits(study_in):
