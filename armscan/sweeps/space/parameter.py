@@ -8,18 +8,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Self
 
-from hydra.core.override_parser.types import Quote, QuotedString
 from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
 from optuna.trial import BaseTrial
 from pydantic import AfterValidator, Field
 
 from armscan.config.defaults import NOT_SEARCHED
 from armscan.config.legacy import renamed
+from armscan.config.literal import hydra_literal
 from armscan.errors import InvalidValueError, reason_of
 from armscan.utils.section import Section
 
 KEY = re.compile(r"[A-Za-z_][\w/]*(\.\w+)*")
-PLAIN_TEXT = re.compile(r"(?!(?i:true|false|null|nan|inf)$)[A-Za-z_][\w./\-]*")
 Value = bool | int | float | str | None
 Number = int | Annotated[float, Field(allow_inf_nan=False)]
 
@@ -157,19 +156,3 @@ def rounded_overrides(chosen: Mapping[str, Value]) -> list[str]:
     return overrides_of(
         {key: float(f"{each:.4g}") if isinstance(each, float) else each for key, each in chosen.items()}
     )
-
-
-def hydra_literal(value: Any) -> str:
-    """Return a value as Hydra reads it on the command line."""
-    if value is None:
-        return "null"
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, list | tuple):
-        return f"[{','.join(map(hydra_literal, value))}]"
-    if isinstance(value, Mapping):
-        return "{" + ",".join(f"{key}:{hydra_literal(each)}" for key, each in value.items()) + "}"
-    # Not the literal of a list or mapping, nor a string that Hydra reads as one anyway.
-    if isinstance(value, str) and not value.startswith(("[", "{")) and not PLAIN_TEXT.fullmatch(value):
-        return QuotedString(value, Quote.single).with_quotes()
-    return str(value)

@@ -9,8 +9,9 @@ from typing import Any, Self
 from optuna.distributions import CategoricalDistribution, distribution_to_json
 from optuna.trial import BaseTrial
 
+from armscan.config.literal import hydra_literal
 from armscan.errors import InvalidValueError, listed
-from armscan.sweeps.space.parameter import Parameter, Value, hydra_literal, optuna_value
+from armscan.sweeps.space.parameter import Parameter, Value, optuna_value
 
 
 @dataclass(frozen=True)

@@ -15,12 +15,12 @@ from omegaconf import OmegaConf
 from armscan.config.command_hints import run_command
 from armscan.config.compose import compose, reduce_to_run
 from armscan.config.defaults import MULTIRUN, NOT_SEARCHED, PLAN, RESUME
+from armscan.config.literal import hydra_literal
 from armscan.config.sources import SWEEP
 from armscan.errors import InvalidValueError
 from armscan.experiment.build import check_config
 from armscan.experiment.effects import check_effects
 from armscan.launch.launchers import LAUNCHER
-from armscan.sweeps.space.parameter import hydra_literal
 
 STUDY = "study"
 TASK_TARGET, TRAINING_TASK = "study.task._target_", "armscan.sweeps.tasks.training.TrainingTask"

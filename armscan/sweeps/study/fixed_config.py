@@ -11,10 +11,10 @@ from omegaconf import DictConfig
 
 from armscan.config.defaults import ADDED, NOT_COMPARED, to_plain
 from armscan.config.legacy import migrate
+from armscan.config.literal import hydra_literal
 from armscan.config.own_code import own_code
 from armscan.config.trust import classes_in_groups
 from armscan.errors import few
-from armscan.sweeps.space.parameter import hydra_literal
 from armscan.sweeps.storage.attribute_names import EARLIER_CONFIGS, FIXED, MEMBER, OBJECTIVES, SPACE
 from armscan.sweeps.study.arguments import STUDY, TRAINING_TASK, fixed_by
 from armscan.sweeps.study.settings import StudySettings

@@ -16,9 +16,10 @@ from optuna.trial import FrozenTrial, create_trial
 from armscan.config.compose import compose_run
 from armscan.config.defaults import to_plain
 from armscan.config.legacy import renamed
+from armscan.config.literal import hydra_literal
 from armscan.errors import StudyError, listed
 from armscan.sweeps.scheduling.state import FINISHED
-from armscan.sweeps.space.parameter import Value, hydra_literal, optuna_value, overrides_of
+from armscan.sweeps.space.parameter import Value, optuna_value, overrides_of
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.storage.attribute_names import (
     BEGUN_WITH,

@@ -14,13 +14,13 @@ from pathlib import Path
 
 from armscan.config.command_hints import armscan_command
 from armscan.config.defaults import TRACKING_URI
+from armscan.config.literal import hydra_literal
 from armscan.config.sources import working_folder
 from armscan.errors import ArmscanError, print_error, reason_of
 from armscan.launch.launchers import ON_THIS_MACHINE, launcher_error, prepare_launcher
 from armscan.sweeps.results.judgement import judge
 from armscan.sweeps.results.progress import progress_display
 from armscan.sweeps.results.study_run import best_metrics, result_note
-from armscan.sweeps.space.parameter import hydra_literal
 from armscan.sweeps.study.arguments import DEFAULT_LAUNCHER, STORAGE, WORKER_KEY, StudyCommand, fixed_by
 from armscan.sweeps.study.dashboard import note_run
 from armscan.sweeps.study.phase import OpenedStudy

@@ -7,8 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from optuna.trial import FixedTrial
 
+from armscan.config.literal import hydra_literal
 from armscan.errors import InvalidValueError
-from armscan.sweeps.space.parameter import hydra_literal, overrides_of
+from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.space.space import Space
 
 DESCRIBED = {
