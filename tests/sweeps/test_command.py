@@ -366,6 +366,7 @@ MISTAKES = [
         "evaluation.episodes is 1001, but final trainings must have at least as many: give also study.final_eval",
     ),
     ("study.final_eval.n_seeds=2", "study.final_eval.n_seeds has been renamed: give study.final_eval.judge_seeds"),
+    ("study.space=3", "study.space.agent.lr.high=0.002", "study.space.agent.lr.low is not set, but it must be"),
     ("study.workers=999", "--plan", "study.workers is 999, but this machine has "),
     ("study.workers=999", "study.workers is 999, but this machine has "),
     (

@@ -99,11 +99,13 @@ def _with_one_space(overrides: Sequence[str]) -> list[str]:
     """Return overrides with at most one of the study's space: of several, Hydra's launcher keeps the last alone."""
     others = [each for each in overrides if SPACE_OVERRIDE.fullmatch(each) is None]
     changes = [_merging(each) for each in overrides if SPACE_OVERRIDE.fullmatch(each)]
-    if len(changes) < 2:
+    given = [fixed_by([change])[SPACE] for change in changes]
+    # A space that is no mapping is refused by the study's settings.
+    if len(changes) < 2 or not all(isinstance(each, Mapping) for each in given):
         return [*others, *changes]
     merged: dict[str, Any] = {}
-    for change in changes:
-        for key, described in fixed_by([change])[SPACE].items():
+    for each in given:
+        for key, described in each.items():
             is_part = isinstance(described, Mapping) and isinstance(merged.get(key), Mapping)
             merged[key] = {**merged[key], **described} if is_part else described
     return [*others, f"++{SPACE}={hydra_literal(merged)}"]
