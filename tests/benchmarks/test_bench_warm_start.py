@@ -19,10 +19,11 @@ def test_the_best_settings_that_fit_are_tried_first(surrogate):
     assert [each.values for each in first] == list(fitting)
 
 
-def test_values_outside_of_the_space_are_left_out(surrogate):
+def test_values_outside_of_the_space_become_the_nearest_in_it(surrogate):
     found = search(surrogate, "sac_y", RULE, n_trainings=20, seed=0)
     outside = tuple(replace(each, values=each.values | {"agent.lr": 1.0}) for each in found.candidates)
-    assert best_that_fit(replace(found, candidates=outside), surrogate.space) == ()
+    fitting = best_that_fit(replace(found, candidates=outside), surrogate.space)
+    assert fitting[0] == found.candidates[0].values | {"agent.lr": 0.01}
 
 
 def test_a_warm_start_from_the_same_space_saves_trials(surrogate):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import warnings
 from collections.abc import Mapping
@@ -112,6 +113,17 @@ class Parameter:
         is_inside = type(value) in ((int,) if whole else (int, float)) and bool(drawn._contains(value))
         return (value,) if is_inside else ()
 
+    def nearest(self, value: Any) -> tuple[Value, ...]:
+        """Return a value if it lies in its range or equals a choice; else the nearest one to a number, or nothing."""
+        drawn: Any = self.distribution
+        if (match := self.matching(value)) or not _is_finite(value):
+            return match
+        if isinstance(drawn, CategoricalDistribution):
+            numbers = [each for each in drawn.choices if _is_finite(each)]
+            return tuple(sorted(numbers, key=lambda each: abs(each - value)))[:1]
+        inside = min(max(value, drawn.low), drawn.high)
+        return (drawn.low + round((inside - drawn.low) / drawn.step) * drawn.step if drawn.step else inside,)
+
     def suggest(self, trial: BaseTrial) -> Value:
         """Return the value of a trial.
 
@@ -138,6 +150,10 @@ class Parameter:
         """The values to check, as all are allowed if these are: every choice, or both ends of the range."""
         drawn: Any = self.distribution
         return tuple(drawn.choices) if isinstance(drawn, CategoricalDistribution) else (drawn.low, drawn.high)
+
+
+def _is_finite(value: Any) -> bool:
+    return type(value) in (int, float) and math.isfinite(value)
 
 
 def optuna_value(value: Any) -> Value:

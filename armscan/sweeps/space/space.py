@@ -49,12 +49,13 @@ class Space:
                 chosen[parameter.name] = parameter.suggest(trial)
         return chosen
 
-    def fit(self, values: Mapping[str, Value], *, partly: bool = False) -> tuple[dict[str, Value], str | None]:
+    def fit(self, values: Mapping[str, Value], *, nearest: bool = False) -> tuple[dict[str, Value], str | None]:
         """Return the values of a trial that lie in the space, and the first misfit.
 
         Args:
             values: Values by name, as Optuna stores them; those of other keys are left out.
-            partly: Whether values may be missing. Default: False.
+            nearest: Whether a number outside of the space is replaced by the nearest value in it, and values may be
+                missing. Default: False.
 
         Returns:
             The values of the parameters that apply; and a message about the first that is missing or lies outside, None
@@ -66,9 +67,10 @@ class Space:
             name = parameter.name
             if not parameter.applies(chosen):
                 continue
-            if name in values and (match := parameter.matching(values[name])):
-                (chosen[name],) = match
-            elif misfit is None and (name in values or not partly):
+            match = parameter.nearest if nearest else parameter.matching
+            if name in values and (matches := match(values[name])):
+                (chosen[name],) = matches
+            elif misfit is None and (name in values or not nearest):
                 value = f"{name}={hydra_literal(values[name])}" if name in values else f"{name} has no value and"
                 misfit = f"{value} is not in the space"
         return chosen, misfit

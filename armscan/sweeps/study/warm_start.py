@@ -152,7 +152,7 @@ def _of_study(
     first_number = max(config_changes(source), default=0)
     for trial in trials:
         params = renamed(trial.params)
-        chosen, misfit = settings.space.fit(before | params, partly=bool(difference))
+        chosen, misfit = settings.space.fit(before | params, nearest=difference is not None)
         if not difference:
             misfit = misfit or _not_searched(params, chosen, now)
             # A value of an earlier configuration.
@@ -171,9 +171,13 @@ def _of_study(
     if _is_opposed(source, wanted):
         return InitialTrials(SOURCE.format(name), f"{message}none taken, because {difference}{left}", ())
     settings_of = {trial.number: chosen for trial, chosen in fitting if chosen}
-    best = best_trials(source, len(trials))
-    first = first_different(settings_of[trial.number] for trial in best if trial.number in settings_of)
+    best = [trial for trial in best_trials(source, len(trials)) if trial.number in settings_of]
+    first = first_different(settings_of[trial.number] for trial in best)
     message += f"none taken with its value, because {difference}; the settings of the best {len(first)} are tried first"
+    # Of equal settings, those of the best trial are tried.
+    params_of = {repr(settings_of[trial.number]): renamed(trial.params) for trial in reversed(best)}
+    if moved := [values for each in first if (values := _moved(params_of[repr(each)], each))]:
+        message += f", {len(moved)} of them with the nearest values of the space, such as {moved[0]}"
     return InitialTrials(SOURCE.format(name), message + left, (), first)
 
 
@@ -216,6 +220,12 @@ def _not_searched(params: Mapping[str, Value], chosen: Mapping[str, Value], fixe
     """Return which value of a trial this study neither searches nor has; None if there is none."""
     other = [key for key, value in params.items() if key not in chosen and (key not in fixed or fixed[key] != value)]
     return f"{other[0]}={hydra_literal(params[other[0]])}, which this study does not try" if other else None
+
+
+def _moved(params: Mapping[str, Value], chosen: Mapping[str, Value]) -> str | None:
+    """Return the first value that is not the trial's own, beside that one; None if all are."""
+    moved = (f"{key}={value} for {params[key]}" for key, value in chosen.items() if value != params[key])
+    return next(moved, None)
 
 
 def _plain(flat: Mapping[str, Any]) -> dict[str, Value]:

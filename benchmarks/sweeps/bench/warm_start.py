@@ -88,8 +88,8 @@ def replays(source: SimulatedSweep, target: SimulatedSweep, n_studies: int) -> p
 
 
 def best_that_fit(found: Search, space: Space) -> tuple[dict[str, Value], ...]:
-    """Return the different settings of the best trials whose values lie in a space, as a study's warm start does."""
-    fits = (space.fit(each.values, partly=True) for each in found.candidates)
+    """Return the different settings of the best trials, with the nearest values of a space, as a warm start does."""
+    fits = (space.fit(each.values, nearest=True) for each in found.candidates)
     return first_different(chosen for chosen, misfit in fits if chosen and misfit is None)
 
 

@@ -190,6 +190,31 @@ def test_values_fit_that_the_distribution_of_a_trial_would_accept(value):
             assert misfit.endswith("is not in the space")
 
 
+@given(st.one_of(st.integers(-3, 20), st.floats(-3, 20), st.booleans(), st.sampled_from(["a", "1"]), st.none()))
+@pytest.mark.parametrize(
+    ("described", "allowed"),
+    [
+        ({"low": 1, "high": 7, "step": 3}, [1, 4, 7]),
+        ({"low": 1, "high": 9, "log": True}, range(1, 10)),
+        ({"low": 0.5, "high": 3.0, "step": 0.5}, [0.5, 1.0, 1.5, 2.0, 2.5, 3.0]),
+        ({"low": 1e-2, "high": 10.0, "log": True}, [1e-2, 10.0]),
+        ({"choices": [None, True, 0.5, 0.9, 0.95]}, [0.5, 0.9, 0.95]),
+    ],
+    ids=str,
+)
+def test_number_outside_of_the_space_becomes_the_nearest_in_it(described, allowed, value):
+    space = Space.read({"a": described})
+    exact, _ = space.fit({"a": value})
+    chosen, misfit = space.fit({"a": value}, nearest=True)
+    if exact or type(value) not in (int, float):
+        assert chosen == exact
+        assert (misfit is None) == bool(exact)
+    else:
+        assert misfit is None
+        assert space.suggest(FixedTrial(chosen)) == chosen
+        assert abs(chosen["a"] - value) == pytest.approx(min(abs(each - value) for each in allowed))
+
+
 @pytest.mark.parametrize(("value", "expected"), [(1.0, 1), (1, 1), (0.1, 0.1), (True, None), (2, None)])
 def test_choice_is_found_by_its_value(value, expected):
     space = Space.read({"agent.lr_end_factor": {"choices": [0.1, 1]}})

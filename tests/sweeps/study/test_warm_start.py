@@ -145,6 +145,32 @@ def test_best_settings_of_another_configuration_are_tried_first_without_their_va
     assert {trial.state for trial in made[2].trials} == {TrialState.WAITING}
 
 
+def test_numbers_outside_of_the_space_are_tried_with_their_nearest_values(study_in):
+    rows = [
+        ({"agent.gamma": 0.99, "agent.lr": 1e-4, "network": "mlp"}, 1.0),
+        ({"agent.gamma": 0.5, "agent.lr": 2e-3, "network": "mlp"}, 2.0),
+        ({"agent.gamma": 0.9, "agent.lr": 2e-3, "network": "cnn"}, 3.0),
+    ]
+    before = {"agent.gamma": {"choices": [0.5, 0.9, 0.99]}, "agent.lr": LR, "network": {"choices": ["mlp", "cnn"]}}
+    study_in("before", before, rows=rows)
+    space = {
+        "agent.gamma": {"choices": [0.5, 0.95]},
+        "agent.lr": LR | {"low": 1e-3},
+        "network": {"choices": ["mlp", "multimodal"]},
+    }
+    made = study_in("now", space, ZY, warm_start=["before"])
+    (told,) = begin(made, ZY)
+    assert told.endswith(
+        "the settings of the best 2 are tried first, 1 of them with the nearest values of the space, such as "
+        "agent.gamma=0.95 for 0.99; 1 do not fit, such as: network=cnn is not in the space"
+    )
+    queued = [trial.system_attrs["fixed_params"] for trial in made[2].trials]
+    assert queued == [
+        {"agent.gamma": 0.95, "agent.lr": 1e-3, "network": "mlp"},
+        {"agent.gamma": 0.5, "agent.lr": 2e-3, "network": "mlp"},
+    ]
+
+
 def test_settings_that_were_best_in_the_other_direction_are_not_tried(study_in):
     study_in("before", {"agent.lr": LR}, rows=[({"agent.lr": 1e-3}, 3.0)])
     made = study_in("now", {"agent.lr": LR}, warm_start=["before"], objectives={"mean_steps": "maximize"})
