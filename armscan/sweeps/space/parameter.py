@@ -122,7 +122,10 @@ class Parameter:
             numbers = [each for each in drawn.choices if _is_finite(each)]
             return tuple(sorted(numbers, key=lambda each: abs(each - value)))[:1]
         inside = min(max(value, drawn.low), drawn.high)
-        return (drawn.low + round((inside - drawn.low) / drawn.step) * drawn.step if drawn.step else inside,)
+        if drawn.step:
+            # A sum of steps may exceed the upper end by a rounding error, which the space would refuse.
+            inside = min(drawn.low + round((inside - drawn.low) / drawn.step) * drawn.step, drawn.high)
+        return (inside,)
 
     def suggest(self, trial: BaseTrial) -> Value:
         """Return the value of a trial.

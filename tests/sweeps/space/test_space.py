@@ -197,6 +197,7 @@ def test_values_fit_that_the_distribution_of_a_trial_would_accept(value):
         ({"low": 1, "high": 7, "step": 3}, [1, 4, 7]),
         ({"low": 1, "high": 9, "log": True}, range(1, 10)),
         ({"low": 0.5, "high": 3.0, "step": 0.5}, [0.5, 1.0, 1.5, 2.0, 2.5, 3.0]),
+        ({"low": 0.1, "high": 0.7, "step": 0.1}, [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7]),
         ({"low": 1e-2, "high": 10.0, "log": True}, [1e-2, 10.0]),
         ({"choices": [None, True, 0.5, 0.9, 0.95]}, [0.5, 0.9, 0.95]),
     ],
