@@ -119,8 +119,7 @@ class Parameter:
         if (match := self.matching(value)) or not _is_finite(value):
             return match
         if isinstance(drawn, CategoricalDistribution):
-            numbers = [each for each in drawn.choices if _is_finite(each)]
-            return tuple(sorted(numbers, key=lambda each: abs(each - value)))[:1]
+            return tuple(sorted(filter(_is_finite, drawn.choices), key=lambda each: abs(each - value)))[:1]
         inside = min(max(value, drawn.low), drawn.high)
         if drawn.step:
             # A sum of steps may exceed the upper end by a rounding error, which the space would refuse.

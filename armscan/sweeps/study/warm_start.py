@@ -19,7 +19,7 @@ from armscan.config.legacy import renamed
 from armscan.config.literal import hydra_literal
 from armscan.errors import StudyError, listed
 from armscan.sweeps.scheduling.state import FINISHED
-from armscan.sweeps.space.parameter import Value, optuna_value, overrides_of
+from armscan.sweeps.space.parameter import Value, optuna_value, overrides_of, rounded_overrides
 from armscan.sweeps.space.space import Space
 from armscan.sweeps.storage.attribute_names import (
     BEGUN_WITH,
@@ -223,9 +223,10 @@ def _not_searched(params: Mapping[str, Value], chosen: Mapping[str, Value], fixe
 
 
 def _moved(params: Mapping[str, Value], chosen: Mapping[str, Value]) -> str | None:
-    """Return the first value that is not the trial's own, beside that one; None if all are."""
-    moved = (f"{key}={value} for {params[key]}" for key, value in chosen.items() if value != params[key])
-    return next(moved, None)
+    """Return the first value that is not the trial's own, and that one; None if all are."""
+    moved = [key for key, value in chosen.items() if value != params[key]]
+    values = (rounded_overrides({moved[0]: each[moved[0]]})[0] for each in (chosen, params)) if moved else ()
+    return " instead of ".join(values) or None
 
 
 def _plain(flat: Mapping[str, Any]) -> dict[str, Value]:

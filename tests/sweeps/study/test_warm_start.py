@@ -162,7 +162,7 @@ def test_numbers_outside_of_the_space_are_tried_with_their_nearest_values(study_
     (told,) = begin(made, ZY)
     assert told.endswith(
         "the settings of the best 2 are tried first, 1 of them with the nearest values of the space, such as "
-        "agent.gamma=0.95 for 0.99; 1 do not fit, such as: network=cnn is not in the space"
+        "agent.gamma=0.95 instead of agent.gamma=0.99; 1 do not fit, such as: network=cnn is not in the space"
     )
     queued = [trial.system_attrs["fixed_params"] for trial in made[2].trials]
     assert queued == [
