@@ -106,13 +106,13 @@ def repeat_grid(grid: GridToRepeat) -> None:
 
 
 def _end_grid(*, is_interrupted: bool) -> int:
-    """Close a grid, and return the exit code; an interrupt meanwhile leaves that to `armscan runs sync`."""
+    """Close a grid, and return the exit code; after an interrupt or an error meanwhile, resuming the grid does it."""
     try:
         return end_grid(is_interrupted=is_interrupted)
     except (KeyboardInterrupt, Exception) as error:
-        if not is_interruption(error):
-            raise
         print_resume_command()
+        if not is_interruption(error):
+            raise_or_exit(error)
         return EXIT_INTERRUPTED
 
 
@@ -160,7 +160,7 @@ def main() -> int:
     except (KeyboardInterrupt, Exception) as error:
         # An interrupt inside compiled code can surface as any other error.
         if not is_interruption(error):
-            end_grid()
+            _end_grid(is_interrupted=False)
             raise_or_exit(error)
     else:
         return _end_grid(is_interrupted=False)

@@ -56,16 +56,23 @@ def run_job(launcher_pid: int) -> None:
     job: Job = invocation.job
     endings = interruptions()
 
+    def write(**outcome: Any) -> None:
+        """Write the outcome; on a full disk, what `start_job` has written stays."""
+        try:
+            job.write_outcome(**outcome)
+        except OSError as error:
+            print(f"[{job.label}] its outcome is not kept: {one_line_message(error)}", file=sys.stderr, flush=True)
+
     def leave(*_: object) -> None:
         """End the job at once, without an exception, which compiled code can turn into any other error."""
-        job.write_outcome(failure=INTERRUPTED)
+        write(failure=INTERRUPTED)
         os._exit(EXIT_INTERRUPTED)
 
     def end(**outcome: Any) -> None:
         """Write the outcome, and ignore later interrupts."""
         for each in endings:
             signal.signal(each, signal.SIG_IGN)
-        job.write_outcome(**outcome)
+        write(**outcome)
 
     for each in endings:
         signal.signal(each, leave)

@@ -187,8 +187,9 @@ def end_grid(*, is_interrupted: bool = False) -> int:
     status = "KILLED" if is_interrupted or (interrupted and not has_failed) else "FAILED" if has_failed else "FINISHED"
     try:
         store, runs = _close_parent(folder, grid, status, outcomes)
-    except TrackingError as error:
-        print(f"{error}; {armscan_command('runs', 'sync', str(folder))} uploads the rest", file=sys.stderr)
+    except (TrackingError, OSError) as error:
+        again = armscan_command("runs", "sync", str(folder))
+        print(f"{one_line_message(error) or error}; {again} uploads the rest", file=sys.stderr)
         store, runs = None, []
     if outcomes:
         from armscan.experiment.console import print_where_to_look
@@ -206,6 +207,8 @@ def end_grid(*, is_interrupted: bool = False) -> int:
         print(f"  run it alone with: {run_command([])} {outcome.overrides}", file=sys.stderr)
     if status != "FINISHED":
         _print_resume_commands(grid, runs)
+        if store is None:
+            print_resume_command()
     if store is not None and not runs:
         remove_run_folder(folder)
         if is_interrupted:

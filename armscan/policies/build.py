@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
+import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -34,12 +35,18 @@ POLICY_TAG = "policy"
 KEPT = "kept"
 # Run tag with the SHA-256 of the model, by which a replaced model is detected.
 SUM_TAG = "policy.sha256"
+# Key of the metadata: why the policy answers differently from the agent that was evaluated.
+DIFFERS = "differs_from_agent"
 # Largest allowed difference of the model from its network; and from the learner and ONNX, which sum in other orders.
 TOLERANCE, ROUNDING_TOLERANCE = 1e-6, 1e-5
 # Rules of the environment that its observations depend on, besides the observation itself.
 OF_OBSERVATION = ("projection", "stack", "memory", "stack_exclude", "stack_memory", "flat", "clustering", "reward")
 # Number of observations that a model is checked with.
 N_OBSERVED = 8
+# Longest time that an ONNX file has for its answers.
+MAX_ANSWER_S = 60.0
+# onnxruntime's highest level of messages.
+FATAL = 4
 
 
 def save_policy(
@@ -103,7 +110,7 @@ def make_model(agent: Learner, env: Env, folder: Path, facts: Mapping[str, Any])
         folder.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as beside:
             made = Path(beside, folder.name)
-            write_model(made, policy, batch, {"differs_from_agent": policy.differs, **facts})
+            write_model(made, policy, batch, {DIFFERS: policy.differs, **facts})
             _check(made, policy, played)
             if folder.exists():
                 folder.replace(Path(beside, "before"))
@@ -174,13 +181,30 @@ def _check(folder: Path, policy: Policy, played: list[tuple[Observed, FloatArray
 
 
 def onnx_answers(file: Path, arrays: Arrays) -> NDArray[np.float32]:
-    """Return the actions of onnxruntime for a batch of observations, shape (n, n_action)."""
+    """Return the actions of onnxruntime for a batch of observations, shape (n, n_action).
+
+    Raises:
+        ExportError: If there is no answer within a minute; a file may contain an endless loop.
+    """
     # Deferred: few commands need it.
     import onnxruntime
 
     session = onnxruntime.InferenceSession(file, providers=["CPUExecutionProvider"])
     inputs = arrays if isinstance(arrays, dict) else {OBSERVATION: arrays}
-    (answers,) = session.run(None, inputs)
+    options = onnxruntime.RunOptions()
+    # Errors are raised; onnxruntime would print them, too.
+    options.log_severity_level = FATAL
+    limit = threading.Timer(MAX_ANSWER_S, setattr, (options, "terminate", True))
+    limit.start()
+    try:
+        (answers,) = session.run(None, inputs, options)
+    # onnxruntime raises the same class for all errors of a run.
+    except Exception as error:
+        if options.terminate:
+            raise ExportError(f"{file.name} has not answered within {MAX_ANSWER_S:g} s") from error
+        raise
+    finally:
+        limit.cancel()
     actions: NDArray[np.float32] = answers
     return actions
 

@@ -52,8 +52,8 @@ class Card:
         Raises:
             TrackingError: If an evaluation cannot be read.
         """
-        text = f"The policy of run `{run.run_id}`, {run.name}."
-        text += f"\n\nNote: this policy has not been evaluated; {differs}." if differs else ""
+        text = f"The policy of run `{run.run_id}`, {_shortened(run.name)}."
+        text += f"\n\nNote: this policy has not been evaluated; {_shortened(differs)}." if differs else ""
         reports = _reports(run, folder)
         if not reports and not differs:
             command = armscan_command("evaluate", run.run_id, tracking=run.uri, trust=run.needs_trust)
@@ -62,15 +62,20 @@ class Card:
         for title, report in reports.items():
             label = _label(report)
             noted = (*report.facts.get("notes", ()), *report.notes(label))
-            notes = "".join(f"\n\nNote: {shorten(note, MAX_NOTE_CHARS, placeholder=' …')}." for note in noted)
+            notes = "".join(f"\n\nNote: {_shortened(note)}." for note in noted)
             result = report.tables()[label].headline
             section = f"\n\n### {title}\n\n{result}\n\n{_table(report).markdown()}{notes}"
-            left_out = f"\n\nLeft out, because it is too long: {shorten(title, MAX_NOTE_CHARS, placeholder=' …')}."
+            left_out = f"\n\nLeft out, because it is too long: {_shortened(title)}."
             # If there is no room for both, the run's own evaluation stays.
             text += next(part for part in (section, left_out, "") if len(text + part) <= MAX_CHARS)
             # Tags cannot say that rules were changed: all are from the first evaluation without changes.
             tags = tags or ({} if report.facts.get("changes") else _tags(report))
         return cls(text, tags)
+
+
+def _shortened(text: str) -> str:
+    """Return a text in one line, so that it cannot add headings to the card, and not too long for it."""
+    return shorten(text, MAX_NOTE_CHARS, placeholder=" …")
 
 
 def _reports(run: FoundRun, folder: Path) -> dict[str, EvaluationReport]:

@@ -8,6 +8,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from mlflow.exceptions import MlflowException
 from mlflow.models import Model
 
@@ -16,7 +17,7 @@ from armscan.agents.policy import SAMPLING
 from armscan.config.defaults import to_plain
 from armscan.errors import ExportError, InvalidValueError
 from armscan.evaluation import agent_of_run, own_split, prepare_on_volumes
-from armscan.policies.build import SUM_TAG, facts_of, make_model, onnx_answers, tags_of_kept
+from armscan.policies.build import DIFFERS, SUM_TAG, facts_of, make_model, onnx_answers, tags_of_kept
 from armscan.policies.model import ONNX_FILE, model_sha256
 from armscan.runs.model_card import Card
 from armscan.tracking import FoundRun, check_artifacts, load_run
@@ -66,7 +67,7 @@ def export_policy(tracking: str, run_id: str, folder: Path, *, trust: bool = Fal
     facts = facts_of(to_plain(source.config), env, source.run.run_id, slice_px)
     if is_sampling:
         # The model is compared with deterministic actions, but the run's figures are of sampled ones.
-        facts["differs_from_agent"] = SAMPLING
+        facts[DIFFERS] = SAMPLING
     make_model(evaluator.agent, env, folder, facts)
     return source.run
 
@@ -95,7 +96,7 @@ def register_policy(tracking: str, run_id: str, name: str, *, trust: bool) -> st
         else:
             check_artifacts(run.store, run.experiment_id)
             export_policy(tracking, run_id, folder, trust=trust)
-        differs = (Model.load(str(folder)).metadata or {}).get("differs_from_agent")
+        differs = (Model.load(str(folder)).metadata or {}).get(DIFFERS)
         card = Card.of(run, Path(beside), differs)
         if not is_kept:
             run.store.log_artifacts(run.run_id, str(folder), POLICY_FOLDER)
@@ -126,18 +127,28 @@ def _check_kept(run: FoundRun, folder: Path) -> None:
     if model_sha256(folder) != run.tags[SUM_TAG]:
         raise _not_kept(run)
     try:
-        model = Model.load(str(folder))
-        of_run = dict(model.metadata or {}).get("run")
-        example: Any = model.load_input_example(str(folder))
-        onnx_answers(folder / ONNX_FILE, example)
+        facts = _checked_facts(folder)
     # A damaged file may raise anything.
     except Exception as error:
         raise ExportError(
-            f"run {run.run_id}: its {POLICY_FOLDER}/ is damaged, it does not answer its own example: {reason_in(error)}"
+            f"run {run.run_id}: its {POLICY_FOLDER}/ is damaged or does not answer its own example: {reason_in(error)}"
         ) from error
     # A SHA-256 may have been copied from another run together with its model.
-    if of_run != run.run_id:
+    if facts.get("run") != run.run_id:
         raise _not_kept(run)
+
+
+def _checked_facts(folder: Path) -> dict[str, Any]:
+    """Return the metadata of a model, whose ONNX file answers the model's example."""
+    model = Model.load(str(folder))
+    facts = dict(model.metadata or {})
+    example: Any = model.load_input_example(str(folder))
+    answers, n_action = onnx_answers(folder / ONNX_FILE, example), len(facts["action"])
+    if answers.ndim != 2 or answers.shape[1] != n_action or not np.isfinite(answers).all():
+        raise ExportError(f"for each observation, it must give as many finite numbers as the action has: {n_action}")
+    if not isinstance(facts.get(DIFFERS, ""), str | None):
+        raise ExportError(f"its {DIFFERS} must be a string")
+    return facts
 
 
 def _not_kept(run: FoundRun) -> ExportError:

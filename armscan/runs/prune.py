@@ -15,8 +15,8 @@ from armscan.errors import TrackingError
 from armscan.runs.query import experiment_ids
 from armscan.runs.run_folder import OwnFolder, RunSkippedError
 from armscan.tracking import TrackingStore, check_version
+from armscan.tracking.outbox import ENDED
 from armscan.tracking.pending_runs import forget
-from armscan.tracking.sync import ENDED
 from armscan.tracking.tags import AGENT_TAG, FOLDER_TAG, PARENT_TAG, TRIAL_TAG
 from armscan.tracking.tracking_store import reason_in
 from armscan.utils.run_files import BEST_CHECKPOINT, LAST_CHECKPOINT

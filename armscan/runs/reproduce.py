@@ -24,7 +24,7 @@ from armscan.runs.compare import Comparison, compare_runs
 from armscan.tracking import FoundRun, code_state, environment_tags, load_agent_run
 from armscan.tracking.environment import CONSTRAINTS_SUM, REPORTED_PACKAGES, environment
 from armscan.tracking.git import COMMIT, DIFF_SUM, DIRTY
-from armscan.tracking.sync import ENDED
+from armscan.tracking.outbox import ENDED
 from armscan.tracking.tags import CHOICE, OVERRIDES_TAG, OWN_CODE_TAG, RESUMED_TAG, UNKNOWN
 from armscan.training import check_unchanged
 from armscan.utils.run_files import DIFF_FILE, ENVIRONMENT_FILE, REPRODUCTION_FILE, folder_lock

@@ -17,8 +17,8 @@ from armscan.errors import UntrustedError
 from armscan.runs.run_folder import OwnFolder, RunSkippedError
 from armscan.stats.on_plane import OnPlane, leading_of
 from armscan.tracking import TrackingStore
+from armscan.tracking.outbox import ENDED
 from armscan.tracking.run import MAX_DEPTH
-from armscan.tracking.sync import ENDED
 from armscan.tracking.tags import PARENT_TAG
 
 # Attributes of a row by sort key.

@@ -14,10 +14,11 @@ from armscan.tracking.lookup import (
 from armscan.tracking.outbox import take_over
 from armscan.tracking.plots import draw_learning_curve
 from armscan.tracking.run import TrackedRun
+from armscan.tracking.run_end import begin_outbox, fail_dead_runs, record_end
 from armscan.tracking.sanitize import flatten, tags_of
 from armscan.tracking.settings import TrackingSettings
 from armscan.tracking.store import check_artifacts, open_existing_store, open_store
-from armscan.tracking.sync import begin_outbox, fail_dead_runs, record_end, sync, upload_pending
+from armscan.tracking.sync import sync, upload_pending
 from armscan.tracking.tracking_store import TrackingStore
 
 __all__ = [

@@ -33,6 +33,8 @@ Channel = Literal["figures", "files"]
 CHANNELS: tuple[Channel, ...] = ("files", "figures")
 UPLOADED, LOCK, SUFFIX = OUTBOX_SUFFIXES
 ID = re.compile(r"[\w-]{1,64}", re.ASCII)
+# Statuses of a run that has ended.
+ENDED = ("FINISHED", "FAILED", "KILLED")
 # The run's previous process may still be shutting down.
 LOCK_TIMEOUT_S = 20.0
 
@@ -119,8 +121,19 @@ class OutboxFile:
     @property
     def status(self) -> str | None:
         """The last status of the run; None if there is none yet."""
-        said = [entry["status"][0] for entry in self.entries() if "status" in entry]
-        return said[-1] if said else None
+        return self._last_status[0]
+
+    @property
+    def status_ms(self) -> int:
+        """When the run got its last status, in milliseconds since 1970; 0 if it has none yet."""
+        return self._last_status[1]
+
+    @property
+    def _last_status(self) -> tuple[str | None, int]:
+        last: tuple[str | None, int] = (None, 0)
+        for entry in self.entries():
+            last = entry.get("status", last)
+        return last
 
     def _read(self, line: bytes) -> Entry:
         try:

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Callable, Iterable, Mapping
+from collections import deque
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from armscan.config.trust import TRUST
 from armscan.errors import FolderInUseError, TrackingError, UntrustedError
-from armscan.tracking.outbox import CHANNELS, Address, Outbox, now_ms, outbox_files
+from armscan.tracking.outbox import CHANNELS, ENDED, Outbox, now_ms, outbox_files
 from armscan.tracking.pending_runs import PendingRun, forget, pending_runs
-from armscan.tracking.run import SHORT_WAIT_S, TrackedRun
-from armscan.tracking.sanitize import tags_of
-from armscan.tracking.store import absolute
 from armscan.tracking.tags import FAILURE_TAG, FOLDER_TAG
 from armscan.tracking.tracking_store import NOT_THERE, TrackingStore, reason_in
 from armscan.tracking.uploader import upload
@@ -25,8 +23,6 @@ from armscan.utils.processes import ProcessInfo
 if TYPE_CHECKING:
     from mlflow.entities import Run
 
-# Statuses of a run that has ended, as its outbox holds them.
-ENDED = ("FINISHED", "FAILED", "KILLED")
 PROCESS_DIED, FOLDER_REMOVED = "its process died", "its process died, and its folder was removed"
 IN_USE = "it is still in progress"
 # Stores whose pending entries this process has looked for.
@@ -74,8 +70,9 @@ def sync(folder: Path, opened: Callable[[str], TrackingStore], *, trust: bool = 
 def _synced(files: Iterable[Path], opened: Callable[[str], TrackingStore], *, trust: bool) -> list[Upload]:
     uploads: list[Upload] = []
     stores: dict[str, TrackingStore | TrackingError] = {}
-    for file in files:
-        run_id = None
+    waiting = deque(files)
+    while waiting:
+        file, run_id = waiting.popleft(), None
         try:
             with contextlib.closing(Outbox(file, timeout_s=0.0)) as outbox:
                 run_id, uri = outbox.address.run_id, outbox.address.uri
@@ -83,6 +80,8 @@ def _synced(files: Iterable[Path], opened: Callable[[str], TrackingStore], *, tr
                 is_open = is_dead and outbox.status not in ENDED and not _is_tracked_beside(file)
                 if outbox.is_uploaded and not is_open:
                     continue
+                # First, so that an interruption cannot leave an older status or description in the store.
+                waiting += _upload_again(outbox)
                 if isinstance(store := stores.get(uri) or _opened(opened, uri), TrackingError):
                     uploads.append(Upload(outbox.folder, run_id, 0, str(store)))
                 else:
@@ -108,9 +107,7 @@ def _pending_of(file: Path) -> PendingRun | None:
 
 def _is_tracked_beside(file: Path) -> bool:
     """Return whether another process tracks the run of an outbox, as several commands of a study do."""
-    file = file.resolve()
-    found = {each.resolve() for each in file.parents[2].glob(f"*/{file.parent.name}/{file.name}")}
-    for other in found - {file}:
+    for other in _outboxes_beside(file):
         try:
             Outbox(other, timeout_s=0.0).close()
         except FolderInUseError:
@@ -118,6 +115,28 @@ def _is_tracked_beside(file: Path) -> bool:
         except (OSError, TrackingError):
             continue
     return False
+
+
+def _outboxes_beside(file: Path) -> list[Path]:
+    """Return the other outboxes of a run, each in the folder of another command of its study."""
+    file = file.resolve()
+    found = {each.resolve() for each in file.parents[2].glob(f"*/{file.parent.name}/{file.name}")}
+    return sorted(found - {file})
+
+
+def _upload_again(outbox: Outbox) -> list[Path]:
+    """Mark the later outboxes of a run as not uploaded: their status and description replace those of this one.
+
+    Raises:
+        FolderInUseError: If another process tracks the run, which uploads this outbox at its end.
+    """
+    later = []
+    for file in _outboxes_beside(outbox.file):
+        with contextlib.closing(Outbox(file, timeout_s=0.0)) as other:
+            if other.status_ms > outbox.status_ms:
+                other.mark("figures", 0)
+                later.append((other.status_ms, file))
+    return [file for _, file in sorted(later)]
 
 
 def _end_removed(run_id: str, pending: PendingRun, opened: Callable[[str], TrackingStore]) -> str | None:
@@ -168,7 +187,7 @@ def _upload_of(outbox: Outbox, store: TrackingStore, *, is_open: bool, trust: bo
 def _end(outbox: Outbox, run: Run) -> None:
     """Add the end of a run whose process died: FAILED, unless the store has a later one, as of an interrupted grid."""
     # A resumed run has begun again.
-    begun_ms = max((each["status"][1] for each in outbox.entries() if "status" in each), default=0)
+    begun_ms = outbox.status_ms
     if run.info.status in ENDED and run.info.end_time is not None and run.info.end_time >= begun_ms:
         outbox.add(status=(run.info.status, run.info.end_time))
     else:
@@ -217,49 +236,3 @@ def _upload_pending(store: TrackingStore) -> None:
         is_over = (is_there or has_ended) and not _is_tracked_beside(pending.outbox)
         if is_over and all(each.left is None for each in uploads):
             forget(run_id)
-
-
-def fail_dead_runs(folder: Path, store: TrackingStore, reason: str) -> None:
-    """Mark the runs of dead processes in a folder tree as FAILED.
-
-    Entries that the store cannot take now stay in the folders of the runs.
-
-    Args:
-        folder: Folder of the runs, or above them.
-        store: Store of the runs.
-        reason: Reason of the failure, for the tag `failure`.
-    """
-    for file in outbox_files(folder):
-        try:
-            outbox = Outbox(file, timeout_s=0.0)
-            is_ended = outbox.status in ENDED
-        # Its process is alive, another has just taken it over, or it is damaged, which `sync` reports.
-        except (FolderInUseError, FileNotFoundError, TrackingError):
-            continue
-        if is_ended:
-            outbox.close()
-        else:
-            TrackedRun(store, outbox, name=outbox.address.run_id).end("FAILED", reason=reason, wait_s=SHORT_WAIT_S)
-
-
-def begin_outbox(folder: Path, run_id: str, uri: str) -> Outbox:
-    """Open the outbox of a run, which is then pending here: if this process dies, a later one closes the run."""
-    outbox = Outbox.begin(folder, Address(run_id, absolute(uri)))
-    outbox.mark_pending(absolute(uri))
-    return outbox
-
-
-def record_end(folder: Path, run_id: str, uri: str, status: str, tags: Mapping[str, str]) -> None:
-    """Record a run's end in its outbox, for `sync` to upload, without contacting the store.
-
-    Args:
-        folder: Folder of the run.
-        run_id: MLflow run ID.
-        uri: Address of its tracking store.
-        status: FINISHED, FAILED or KILLED.
-        tags: Tags to set.
-    """
-    with contextlib.closing(begin_outbox(folder, run_id, uri)) as outbox:
-        if tags:
-            outbox.add(tags=tags_of(tags))
-        outbox.add(status=(status, now_ms()))

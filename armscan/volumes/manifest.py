@@ -239,6 +239,9 @@ def _checked_planes(planes: Any) -> dict[str, Document]:
 def _load(path: Path) -> Document:
     """Read the file, JSON or YAML, without validation."""
     is_json = path.suffix == ".json"
+    # A pipe or a device would be read for ever.
+    if path.exists() and not path.is_file():
+        raise ManifestError(f"{path}: the manifest is not a file, or a link to one")
     try:
         text = path.read_text(encoding="utf-8-sig")
         document = json.loads(text, object_pairs_hook=_without_duplicates) if is_json else load_yaml(text)

@@ -45,17 +45,22 @@ def resample(volume: LabelVolume, spacing: Spacing) -> LabelVolume:
     # Deferred: slow to import, and few folders need it.
     import SimpleITK
 
-    # A centre on the far edge itself is no longer inside.
-    n_voxels = np.divide((np.array(volume.shape) - 0.5) * volume.spacing, spacing)
-    if not n_voxels.prod() <= MAX_VOXELS:
+    # Infinitely many are too many as well.
+    with np.errstate(over="ignore"):
+        # A centre on the far edge itself is no longer inside.
+        size = np.divide((np.array(volume.shape) - 0.5) * volume.spacing, spacing)
+        size = np.maximum(1, np.ceil(size - 1e-6))
+        n_voxels = size.prod()
+    if not n_voxels <= MAX_VOXELS:
         raise VolumeError(
-            f"{volume.name}: resampled from {volume.spacing} to {spacing} mm it would have {n_voxels.prod():.3g} "
-            f"voxels, but it must have at most {MAX_VOXELS}"
+            f"{volume.name}: resampled from {volume.spacing} to {spacing} mm it would have {n_voxels:.3g} voxels, but "
+            f"it must have at most {MAX_VOXELS}"
         )
-    size = np.maximum(1, np.ceil(n_voxels - 1e-6)).astype(int).tolist()
     # In the volume's own frame: its transform to world coordinates does not change.
     image = SimpleITK.GetImageFromArray(np.ascontiguousarray(volume.labels.transpose(2, 1, 0)))
     image.SetSpacing(volume.spacing)
     unmoved, nearest = SimpleITK.Transform(), SimpleITK.sitkNearestNeighbor
-    finer = SimpleITK.Resample(image, size, unmoved, nearest, image.GetOrigin(), spacing, image.GetDirection())
+    finer = SimpleITK.Resample(
+        image, size.astype(int).tolist(), unmoved, nearest, image.GetOrigin(), spacing, image.GetDirection()
+    )
     return replace(volume, labels=SimpleITK.GetArrayFromImage(finer).transpose(2, 1, 0), spacing=spacing)

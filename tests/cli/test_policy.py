@@ -6,9 +6,12 @@ from functools import partial
 
 import mlflow.pyfunc
 import numpy as np
+import onnx
 import pytest
+from onnx import TensorProto, helper, numpy_helper
 
 from armscan.agents.policy import SAMPLING
+from armscan.policies import build
 from armscan.policies.build import SUM_TAG
 from armscan.policies.model import model_sha256
 from armscan.runs.model_card import MAX_CHARS
@@ -231,14 +234,64 @@ def test_policy_of_another_run_is_not_registered_in_the_place_of_the_kept_one(an
     assert store_of(tmp_path).get_run(run_id).data.tags[SUM_TAG] == model_sha256(model)
 
 
-def test_model_that_does_not_answer_is_not_registered_and_only_one_line_told(answer, tmp_path):
+def damaged(network, how):
+    """Return an ONNX network whose last step is endless, infinite or too wide."""
+    model = onnx.load_from_string(network)
+    graph, last = model.graph, model.graph.output[0].name
+    for node in graph.node:
+        node.output[:] = ["before" if name == last else name for name in node.output]
+    graph.output[0].type.tensor_type.ClearField("shape")
+    values = {"true": np.array(True), "zero": np.array(0, np.float32)}
+    graph.initializer.extend(numpy_helper.from_array(value, name) for name, value in values.items())
+    kinds = [("n", TensorProto.INT64, []), ("again", TensorProto.BOOL, []), ("kept", TensorProto.FLOAT, None)]
+    same = [helper.make_node("Identity", [name], [f"{name}_after"]) for name in ("again", "kept")]
+    inputs = [helper.make_tensor_value_info(*each) for each in kinds]
+    outputs = [helper.make_tensor_value_info(f"{name}_after", *each) for name, *each in kinds[1:]]
+    loop = helper.make_graph(same, "loop", inputs, outputs)
+    last_node = {
+        "endless": helper.make_node("Loop", ["", "true", "before"], [last], body=loop),
+        "infinite": helper.make_node("Div", ["before", "zero"], [last]),
+        "wider": helper.make_node("Concat", ["before", "before"], [last], axis=1),
+    }[how]
+    graph.node.append(last_node)
+    return model.SerializeToString()
+
+
+def test_model_that_does_not_answer_is_not_registered_and_only_one_line_told(answer, tmp_path, monkeypatch):
     run_id, model = registered(answer, tmp_path)
-    program = model / "policy.onnx"
-    program.write_bytes(program.read_bytes()[:1000])
-    store_of(tmp_path).set_tag(run_id, SUM_TAG, model_sha256(model))
-    line = f"run {run_id}: its policy/ is damaged, it does not answer its own example: "
-    assert_refused(answer("register", run_id, "--name=n"), line)
+    program, facts = model / "policy.onnx", model / "MLmodel"
+    text = facts.read_text()
+    network = program.read_bytes()
+    monkeypatch.setattr(build, "MAX_ANSWER_S", 1.0)
+
+    def is_refused(reason):
+        store_of(tmp_path).set_tag(run_id, SUM_TAG, model_sha256(model))
+        line = f"run {run_id}: its policy/ is damaged or does not answer its own example: "
+        refused = answer("register", run_id, "--name=n")
+        assert_refused(refused, line)
+        assert reason in refused[2]
+
+    program.write_bytes(network[:1000])
+    is_refused("")
+    program.write_bytes(damaged(network, "endless"))
+    is_refused("policy.onnx has not answered within 1 s")
+    for how in ("infinite", "wider"):
+        program.write_bytes(damaged(network, how))
+        is_refused("for each observation, it must give as many finite numbers as the action has: 1")
+    program.write_bytes(network)
+    for differs in ("[a, b]", ".nan", "{a: b}"):
+        facts.write_text(text.replace("differs_from_agent: null", f"differs_from_agent: {differs}"))
+        is_refused("its differs_from_agent must be a string")
     assert len(versions_in(tmp_path)) == 1
+
+    # It cannot add headings to the card, nor make it too long.
+    headings = json.dumps("# a\n" * 9000)
+    facts.write_text(text.replace("differs_from_agent: null", f"differs_from_agent: {headings}"))
+    store_of(tmp_path).set_tag(run_id, SUM_TAG, model_sha256(model))
+    assert answer("register", run_id, "--name=n")[0] == 0
+    card = store_of(tmp_path).get_model_version("n", "2").description
+    assert "Note: this policy has not been evaluated; # a # a" in card
+    assert len(card) < MAX_CHARS
 
 
 def test_policy_is_not_registered_with_a_damaged_evaluation(answer, tmp_path):

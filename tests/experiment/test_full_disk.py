@@ -1,5 +1,6 @@
 """Disks that are full under a run's folder, and under its tracking store."""
 
+import re
 import sqlite3
 import subprocess
 import sys
@@ -62,3 +63,19 @@ def test_run_goes_on_while_the_disk_of_its_store_is_full_and_sync_uploads_the_re
     assert synced.returncode == 0, synced.stdout + synced.stderr
     assert armscan_run(*words, cwd=tmp_path).returncode == 0
     assert_ended_alike(disk.folder)
+
+
+def test_grid_whose_folder_is_full_tells_the_cause_and_how_to_resume_it(disk, tmp_path):
+    words = ["-m", "seed=1,2", *(each for each in LONGER if not each.startswith("seed="))]
+    code, _, told = run_until_full(disk, *words, f"hydra.sweep.dir={disk.folder}/grid", cwd=tmp_path)
+    assert code != 0
+    assert "Traceback" not in told
+    for label in ("0 seed=1", "1 seed=2"):
+        assert f"[{label}] failed: {disk.folder}/grid" in told
+    resumed = re.search(r"resume=[0-9a-f]{32}$", told)
+    assert resumed is not None, told
+    disk.empty()
+    again = armscan_run(resumed[0], cwd=tmp_path)
+    assert again.returncode == 0, again.stderr
+    # The new grid and both jobs; a job without a checkpoint has begun again as a new run.
+    assert [run.info.status for run in runs_in(tmp_path)[1]].count("FINISHED") == 3

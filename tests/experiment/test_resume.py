@@ -15,7 +15,7 @@ import pytest
 
 import armscan
 from armscan.tracking.outbox import Address, Outbox
-from armscan.tracking.sync import begin_outbox
+from armscan.tracking.run_end import begin_outbox
 from armscan.tracking.tags import GRID_TAG
 from armscan.training import load_checkpoint
 from armscan.utils.files import sha256

@@ -3,6 +3,7 @@
 import json
 import math
 import multiprocessing
+import os
 import re
 from dataclasses import fields
 
@@ -83,6 +84,17 @@ def test_manifest_may_be_missing_where_that_is_said(folder):
     with pytest.raises(ManifestError, match="the folder has no manifest"):
         open_dataset(folder)
     assert list(open_dataset(folder, require_manifest=False).volumes) == ["a.nii.gz", "b.nrrd"]
+
+
+def test_manifest_that_is_a_pipe_or_a_device_is_refused(folder):
+    manifest = folder / "manifest.yaml"
+    manifest.unlink(missing_ok=True)
+    os.mkfifo(manifest)
+    for _ in range(2):
+        with pytest.raises(ManifestError, match=r"manifest\.yaml: the manifest is not a file"):
+            open_dataset(folder)
+        manifest.unlink()
+        manifest.symlink_to("/dev/zero")
 
 
 def test_manifest_stands_alone(folder):

@@ -114,12 +114,17 @@ class Parameter:
         return (value,) if is_inside else ()
 
     def nearest(self, value: Any) -> tuple[Value, ...]:
-        """Return a value if it lies in its range or equals a choice; else the nearest one to a number, or nothing."""
+        """Return a value if it lies in its range or equals a choice; else the nearest one to a number, or nothing.
+
+        Of several choices it is the nearest by ratio, as learning rates are compared, if all are positive.
+        """
         drawn: Any = self.distribution
         if (match := self.matching(value)) or not _is_finite(value):
             return match
         if isinstance(drawn, CategoricalDistribution):
-            return tuple(sorted(filter(_is_finite, drawn.choices), key=lambda each: abs(each - value)))[:1]
+            numbers: list[Any] = [each for each in drawn.choices if _is_finite(each)]
+            scale = math.log if all(each > 0 for each in (value, *numbers)) else float
+            return tuple(sorted(numbers, key=lambda each: abs(scale(each) - scale(value))))[:1]
         inside = min(max(value, drawn.low), drawn.high)
         if drawn.step:
             # A sum of steps may exceed the upper end by a rounding error, which the space would refuse.

@@ -1,5 +1,7 @@
 """Search spaces: what they may contain, what a trial is given, and how that is written."""
 
+import math
+
 import optuna
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -213,7 +215,14 @@ def test_number_outside_of_the_space_becomes_the_nearest_in_it(described, allowe
     else:
         assert misfit is None
         assert space.suggest(FixedTrial(chosen)) == chosen
-        assert abs(chosen["a"] - value) == pytest.approx(min(abs(each - value) for each in allowed))
+        scale = math.log if "choices" in described and value > 0 else float
+        distances = [abs(scale(each) - scale(value)) for each in allowed]
+        assert abs(scale(chosen["a"]) - scale(value)) == pytest.approx(min(distances))
+
+
+def test_nearest_learning_rate_of_several_is_the_nearest_by_ratio():
+    space = Space.read({"agent.lr": {"choices": [1e-6, 1e-3]}})
+    assert space.fit({"agent.lr": 2e-4}, nearest=True)[0] == {"agent.lr": 1e-3}
 
 
 @pytest.mark.parametrize(("value", "expected"), [(1.0, 1), (1, 1), (0.1, 0.1), (True, None), (2, None)])
