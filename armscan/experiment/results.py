@@ -35,7 +35,8 @@ LAST_VALIDATION, BEST_VALIDATION, NEW_EPISODES = "last validation", "best valida
 AGENT = "agent"
 TITLES = {
     TEST: "agent, test",
-    VALIDATION: "agent, validation",
+    # Of the epoch that has the best one: see `docs/metrics.md`.
+    VALIDATION: f"agent, {BEST_VALIDATION}",
     LAST_VALIDATION: f"agent, {LAST_VALIDATION}",
     BEST_VALIDATION: f"agent, {BEST_VALIDATION}",
     NEW_EPISODES: f"agent, {NEW_EPISODES}",
