@@ -44,7 +44,7 @@ SMALL = (
 OF_PHANTOMS = ("data.n_training=2", "data.n_validation=1", "data.n_test=2")
 OF_STUDIES = (
     *("study.n_trials=2", "study.final_eval.top_k=1", "study.final_eval.min_seeds=1"),
-    *("study.final_eval.mean_seeds=1", "study.final_eval.judge_seeds=1", "study.final_eval.episodes=3"),
+    *("study.final_eval.mean_seeds=1", "study.final_eval.test_seeds=1", "study.final_eval.episodes=3"),
 )
 OWN_VOLUMES = ("data=nifti", "data=mixed")
 

@@ -86,7 +86,7 @@ def _watch(write: Callable[[int | None], Path]) -> None:
 def _reporter_on_study(name: str, uri: str, out: Path | None) -> Callable[[int | None], Path]:
     """Return a function that writes the current report of a study, for a browser that reloads it every few seconds."""
     from armscan.sweeps.results.report import write_report
-    from armscan.sweeps.storage.attributes import FINAL_SUFFIXES, JUDGEMENT_SUFFIX, check_trials
+    from armscan.sweeps.storage.attributes import FINAL_SUFFIXES, TEST_SUFFIX, check_trials
     from armscan.sweeps.storage.storage import existing_storage
     from armscan.sweeps.study.final_eval_storage import stored_final_eval
     from armscan.sweeps.study.settings import check_study_name
@@ -107,7 +107,7 @@ def _reporter_on_study(name: str, uri: str, out: Path | None) -> Callable[[int |
     def write(refresh_s: int | None) -> Path:
         check_trials(study)
         evaluated = []
-        if (final := storage.study(name + JUDGEMENT_SUFFIX)) is not None:
+        if (final := storage.study(name + TEST_SUFFIX)) is not None:
             check_trials(final, n_searched=len(study.get_trials(deepcopy=False)))
             evaluated = final.get_trials(deepcopy=False)
         stored = stored_final_eval(storage, study)

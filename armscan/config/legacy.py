@@ -28,7 +28,9 @@ RENAMED_KEYS = {
     "training.epoch_env_steps": "training.eval_every_env_steps",
 }
 # In the section `study`, which runs do not store.
-RENAMED_KEYS_OF_STUDIES = {"study.final_eval.n_seeds": "study.final_eval.judge_seeds"}
+RENAMED_KEYS_OF_STUDIES = {
+    f"study.final_eval.{before}_seeds": "study.final_eval.test_seeds" for before in ("n", "judge")
+}
 INVERTED = ("agent.judged_by_sampling",)
 # Truth values of a configuration, and of MLflow's parameters.
 OPPOSITES = {True: False, False: True, "True": "False", "False": "True"}

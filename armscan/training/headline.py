@@ -97,7 +97,7 @@ def headline(results: Mapping[str, MetricEstimates], randoms: Mapping[str, Metri
     far = ", ".join(_text(best.estimates[metric], form) for metric, form in DISTANCES if metric in best.estimates)
     sentences = (
         f"{limits.title.capitalize()}: {which} {_text(best.estimate(limits.metric), '{:.1%}')}{beside}.",
-        _verdict(best.estimates.get(ABOVE_RANDOM)),
+        _beside_random_text(best.estimates.get(ABOVE_RANDOM)),
         f"Median distance {far}." if far else "",
     )
     return " ".join(filter(None, sentences))
@@ -113,8 +113,8 @@ def _rates(evaluation: Evaluation) -> dict[str, float]:
     return {name: each.on_plane_rate for name, each in evaluation.by_volume().items()}
 
 
-def _verdict(above: Estimate | None) -> str:
-    """Return whether an agent is better than random planes, judged by the interval of the difference."""
+def _beside_random_text(above: Estimate | None) -> str:
+    """Return whether an agent is better than random planes, by the interval of the difference."""
     if above is None or math.isnan(above.value):
         return ""
     points = Estimate(*(100 * each for each in above))

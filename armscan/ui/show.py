@@ -70,8 +70,8 @@ def show(
         runs_at = f"http://{HOST}:{mlflow_port}" if has_runs else None
         dashboard = start_dashboard(studies, artifacts, dashboard_port, mlflow=runs_at)
         print(f"studies   {dashboard}", flush=True)
-        if (judged := newest_judged(studies)) is not None:
-            name, number = judged
+        if (tested := newest_tested(studies)) is not None:
+            name, number = tested
             print(f"result    {dashboard}/dashboard/studies/{number}/note (study {printable(name)})", flush=True)
     if has_runs:
         with mlflow_server(tracking, mlflow_port) as process:
@@ -86,20 +86,20 @@ def show(
         threading.Event().wait()
 
 
-def newest_judged(storage: Storage) -> tuple[str, int] | None:
+def newest_tested(storage: Storage) -> tuple[str, int] | None:
     """Return the name and the ID of the newest study with a result; None if there is none."""
     # Deferred, as above.
     from optuna.trial import TrialState
 
-    from armscan.sweeps.storage.attributes import JUDGEMENT_SUFFIX
+    from armscan.sweeps.storage.attributes import TEST_SUFFIX
 
-    def is_judged(name: str) -> bool:
-        judgement = storage.study(f"{name}{JUDGEMENT_SUFFIX}")
-        return judgement is not None and bool(judgement.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)))
+    def is_tested(name: str) -> bool:
+        test = storage.study(f"{name}{TEST_SUFFIX}")
+        return test is not None and bool(test.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)))
 
     numbers = {study.study_name: study._study_id for study in storage.optuna.get_all_studies()}
-    judged = filter(is_judged, numbers)
-    return max(((name, numbers[name]) for name in judged), key=itemgetter(1), default=None)
+    tested = filter(is_tested, numbers)
+    return max(((name, numbers[name]) for name in tested), key=itemgetter(1), default=None)
 
 
 def _has_runs(uri: str) -> bool:

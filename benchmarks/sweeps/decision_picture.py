@@ -19,7 +19,7 @@ from armscan.sweeps.scheduling.race import MAX_SEEDS_FACTOR, Race, race
 from benchmarks.arguments import parser_of
 from benchmarks.repository import PICTURES
 
-N_TRIALS, N_VALIDATION, N_TEST, N_JUDGING = 30, 8, 12, 5
+N_TRIALS, N_VALIDATION, N_TEST, N_TEST_SEEDS = 30, 8, 12, 5
 MIN_SEEDS, MEAN_SEEDS = 2, 12
 MAX_SEEDS = MAX_SEEDS_FACTOR * MEAN_SEEDS
 CONTROL, CONTROL_STEPS = -1, 2.6
@@ -45,7 +45,7 @@ def main() -> None:
     scores = {number: dict(enumerate(-trained(number, MAX_SEEDS, N_VALIDATION).mean(axis=1))) for number in steps}
     raced = race(scores, range(MAX_SEEDS), min_seeds=MIN_SEEDS, mean_seeds=MEAN_SEEDS)
     assert raced.chosen is not None
-    ours, theirs = (trained(number, N_JUDGING, N_TEST) for number in (raced.chosen, CONTROL))
+    ours, theirs = (trained(number, N_TEST_SEEDS, N_TEST) for number in (raced.chosen, CONTROL))
     mpl.rcParams |= {
         "font.family": "sans-serif",
         "font.size": 10,
@@ -56,7 +56,7 @@ def main() -> None:
     figure, axes = plt.subplots(1, 3, figsize=(12, 3.6), width_ratios=(1.15, 1.2, 1))
     draw_search(axes[0], seen, steps)
     draw_selection(axes[1], scores, raced)
-    draw_judgement(axes[2], ours, theirs, raced.chosen)
+    draw_test(axes[2], ours, theirs, raced.chosen)
     for each in axes:
         each.spines[["top", "right"]].set_visible(False)
     figure.tight_layout(w_pad=2.5)
@@ -104,7 +104,7 @@ def draw_selection(axes: Axes, scores: dict[int, dict[int, float]], raced: Race)
     axes.set_ylim(len(order) - 0.5, -0.5)
 
 
-def draw_judgement(axes: Axes, ours: np.ndarray, theirs: np.ndarray, chosen: int) -> None:
+def draw_test(axes: Axes, ours: np.ndarray, theirs: np.ndarray, chosen: int) -> None:
     """Draw the difference of each seed, and of all with its interval."""
     difference, probability = paired_difference(ours, theirs), probability_of_improvement(-ours, -theirs)
     axes.axvline(0.0, color="#444", linewidth=1)
@@ -124,7 +124,7 @@ def draw_judgement(axes: Axes, ours: np.ndarray, theirs: np.ndarray, chosen: int
         bbox=PAPER,
     )
     axes.set(
-        title="3  Judgement: test volumes, new seeds",
+        title="3  Test: test volumes, new seeds",
         xlabel=f"steps of trial {chosen} less those of the control",
         yticks=[],
         ylim=(-1, 1),

@@ -13,7 +13,7 @@ its trainings. Both sides have the same space, presets, training seeds and objec
 - Hydra's Optuna sweeper: its default sampler. The trial with the best value is the result.
 
 A trial starts while budget is left, and always runs to its end. Both results and the default configuration are then
-trained with new seeds, and judged by the objective on the test volumes. Each outcome is a line of `results.jsonl`:
+trained with new seeds, and compared by the objective on the test volumes. Each outcome is a line of `results.jsonl`:
 the same command continues after an interruption, and repeats only the search that was cut off. Several processes may
 share the folder if their replicates or tasks differ. `--replicates 0` prints the table of all results so far.
 """
@@ -58,7 +58,7 @@ TASKS = {
 ARMSCAN, HYDRA, DEFAULT = "armscan", "hydra", "default"
 Search = Callable[[Sequence[str], float, Path], SearchResult]
 SEARCHES: dict[str, Search] = {ARMSCAN: search_by_armscan, HYDRA: search_by_hydra}
-# First seed of the judgement; seeds of searches begin at 0, seeds of races 1000 above.
+# First seed of the comparison; seeds of searches begin at 0, seeds of races 1000 above.
 FIRST_SEED, SEEDS_APART = 5000, 10
 OBJECTIVE = "mean_steps"
 SHORT = ("training.env_steps=3000", "training.eval_every_env_steps=1000")
@@ -94,7 +94,7 @@ def same_budget(
         tasks: Names of the tasks. Default: all.
         first: Number of the first replicate, from 0. Default: 0.
         replicates: Number of replicates. Default: 4.
-        seeds: Number of seeds that judge each configuration. Default: 8.
+        seeds: Number of seeds of each configuration on the test volumes. Default: 8.
     """
     if unknown := [name for name in tasks if name not in TASKS]:
         raise InvalidValueError(f"--tasks: {unknown[0]!r} is none of {', '.join(TASKS)}")

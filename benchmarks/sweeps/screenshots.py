@@ -28,7 +28,7 @@ from tests.support.browser import chromium
 
 STUDY = (
     *("-m", "sweep=sac_y", "study.n_trials=24", "training.env_steps=6000", "study.workers=1"),
-    *("study.final_eval.top_k=1", "study.final_eval.mean_seeds=2", "study.final_eval.judge_seeds=3"),
+    *("study.final_eval.top_k=1", "study.final_eval.mean_seeds=2", "study.final_eval.test_seeds=3"),
 )
 NAME, N_TRIALS = "sac_y", 24
 WIDTH_PX, N_COLOURS = 1400, 256

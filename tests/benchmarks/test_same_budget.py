@@ -54,7 +54,7 @@ def test_time_between_trials_is_not_charged(clock):
 
 
 def settings(min_seeds, mean_seeds):
-    return FinalEvalSettings(top_k=2, min_seeds=min_seeds, mean_seeds=mean_seeds, judge_seeds=1, episodes=3)
+    return FinalEvalSettings(top_k=2, min_seeds=min_seeds, mean_seeds=mean_seeds, test_seeds=1, episodes=3)
 
 
 def test_a_race_that_is_cut_off_is_decided_by_the_seeds_that_are_complete():

@@ -140,7 +140,7 @@ def make_mixed(wrist, variant, **changes):
 
 
 @pytest.mark.parametrize("variant", ["on_budget", "on_stop"])
-def test_env_conforms_where_the_last_plane_is_judged(wrist, variant):
+def test_env_conforms_where_the_last_plane_is_tested(wrist, variant):
     env = make_mixed(wrist, variant)
     check_env(Presented(env), skip_render_check=True)
     assert data_equivalence(play(pickle.loads(pickle.dumps(env))), play(env), exact=True)

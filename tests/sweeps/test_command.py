@@ -45,7 +45,7 @@ TINY = [
         "study.final_eval.top_k=1",
         "study.final_eval.min_seeds=1",
         "study.final_eval.mean_seeds=1",
-        "study.final_eval.judge_seeds=1",
+        "study.final_eval.test_seeds=1",
         "study.final_eval.episodes=4",
     ),
 ]
@@ -108,7 +108,7 @@ def check_values(folder, runs):
 
 @pytest.mark.full
 @pytest.mark.usefixtures("database")
-def test_study_runs_its_trials_judges_the_best_and_goes_on_when_it_is_asked_for_more(tmp_path, monkeypatch):
+def test_study_runs_its_trials_tests_the_best_and_goes_on_when_it_is_asked_for_more(tmp_path, monkeypatch):
     ended = armscan_run(*TINY, "study.n_trials=2", cwd=tmp_path)
     assert ended.returncode == 0, ended.stderr
     assert ended.stderr == ""
@@ -116,7 +116,7 @@ def test_study_runs_its_trials_judges_the_best_and_goes_on_when_it_is_asked_for_
     assert ended.stdout.count(" done: mean_steps ") == 4
     for line in (
         "selection of control with seed 1000 done: ",
-        "judgement of control with seed 2000 done: ",
+        "test of control with seed 2000 done: ",
         "result: ",
     ):
         assert line in ended.stdout
@@ -125,7 +125,7 @@ def test_study_runs_its_trials_judges_the_best_and_goes_on_when_it_is_asked_for_
     check_values(tmp_path, runs)
     by_id = {each.info.run_id: each for each in runs}
     assert {each.info.status for each in runs} == {"FINISHED"}
-    # Only the trainings of the judgement keep their policies.
+    # Only the trainings of the test keep their policies.
     kept = [each.data.tags["folder"] for each in runs if each.data.tags.get("policy") == "kept"]
     assert sorted(kept) == sorted(str(model.parent.parent) for model in tmp_path.glob("studies/**/MLmodel"))
     assert all("/judged/" in folder for folder in kept)
@@ -358,14 +358,14 @@ MISTAKES = [
         "study.final_eval.min_seeds is 2, but it must be at most study.final_eval.mean_seeds, which is 1",
     ),
     (
-        "study.final_eval.judge_seeds=0",
-        "study.final_eval.judge_seeds is 0, but it must be a whole number from 1 to 1000",
+        "study.final_eval.test_seeds=0",
+        "study.final_eval.test_seeds is 0, but it must be a whole number from 1 to 1000",
     ),
     (
         "evaluation.episodes=1001",
         "evaluation.episodes is 1001, but final trainings must have at least as many: give also study.final_eval",
     ),
-    ("study.final_eval.n_seeds=2", "study.final_eval.n_seeds has been renamed: give study.final_eval.judge_seeds"),
+    ("study.final_eval.n_seeds=2", "study.final_eval.n_seeds has been renamed: give study.final_eval.test_seeds"),
     ("study.space=3", "study.space.agent.lr.high=0.002", "study.space.agent.lr.low is not set, but it must be"),
     ("study.workers=999", "--plan", "study.workers is 999, but this machine has "),
     ("study.workers=999", "study.workers is 999, but this machine has "),

@@ -37,7 +37,7 @@ def test_difference_is_that_of_a_paired_t_test_over_the_volumes():
 
 
 @pytest.mark.parametrize(
-    ("rates", "random_rates", "verdict"),
+    ("rates", "random_rates", "comparison"),
     [
         ([0.9, 0.8, 0.85, 0.9], [0.5, 0.45, 0.4, 0.5], "Better than random: +40.0 points ("),
         ([0.1, 0.2, 0.1, 0.15], [0.5, 0.45, 0.4, 0.5], "Worse than random: -32.5 points ("),
@@ -45,8 +45,8 @@ def test_difference_is_that_of_a_paired_t_test_over_the_volumes():
         ([0.9], [0.5], "Difference +40.0 points, one subject and one seed: this allows no conclusion about others."),
     ],
 )
-def test_verdict_follows_the_interval_of_the_difference(rates, random_rates, verdict):
-    assert verdict in said_of(rates, random_rates)
+def test_comparison_follows_the_interval_of_the_difference(rates, random_rates, comparison):
+    assert comparison in said_of(rates, random_rates)
 
 
 def test_difference_that_is_the_same_on_all_volumes_has_an_interval_for_other_episodes():

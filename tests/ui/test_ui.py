@@ -22,7 +22,7 @@ from armscan.sweeps.storage.database import tables_in
 from armscan.sweeps.storage.storage import open_storage
 from armscan.ui import servers
 from armscan.ui.servers import HOST
-from armscan.ui.show import newest_judged
+from armscan.ui.show import newest_tested
 from tests.support import FEW_VOLUMES
 from tests.support.ports import free_ports
 from tests.support.postgres import PASSWORD
@@ -176,12 +176,12 @@ def test_page_of_the_last_study_with_a_result_is_found(tmp_path):
     for name in ("a", "a-selection", "a-judged", "b", "b-selection", "b-judged", "c", "c-selection", "c-judged"):
         study = optuna.create_study(study_name=name, storage=storage.optuna)
         if name == "a":
-            assert newest_judged(storage) is None
-        # A study that has begun has an empty judgement.
+            assert newest_tested(storage) is None
+        # A study that has begun has an empty test.
         if name in ("a-judged", "b-judged"):
             attributes = {"judged": -1, "judged_seed": 2000, "figures": {}}
             study.add_trial(optuna.trial.create_trial(value=1.0, user_attrs=attributes))
-    assert newest_judged(storage) == ("b", 3)
+    assert newest_tested(storage) == ("b", 3)
 
 
 def test_ui_shows_what_is_there_until_it_is_interrupted(both, look):

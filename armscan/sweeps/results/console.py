@@ -14,10 +14,10 @@ from armscan.errors import print_error, printable
 from armscan.experiment.console import print_result_table, print_where_to_look
 from armscan.sweeps.results.difference import HOW
 from armscan.sweeps.results.final_results import final_table
-from armscan.sweeps.results.judgement import judge
 from armscan.sweeps.results.notes import notes_on
 from armscan.sweeps.results.progress import status_line
 from armscan.sweeps.results.selection import candidates_of, objective_of
+from armscan.sweeps.results.study_result import study_result
 from armscan.sweeps.scheduling.population import searched_values
 from armscan.sweeps.space.parameter import rounded_overrides
 from armscan.sweeps.storage.attribute_names import FAILURE
@@ -77,7 +77,7 @@ def _print_best(opened: OpenedStudy) -> None:
     wide_console(WHOLE_CHARS).print(table)
     for trial in best:
         print_sentence(f"trial {trial.number}: {' '.join(rounded_overrides(searched_values(trial)))}")
-    # A judgement has these notes too.
+    # The result of a study has these notes, too.
     for note in () if opened.final_eval is not None else notes_on(opened.search.scheduler.study):
         print_sentence(printable(f"note: {note}"))
 
@@ -110,24 +110,24 @@ def _print_final_results(opened: OpenedStudy, final: FinalEvaluation) -> int:
         objective = objective_of(final)
         title = f"selection on the validation volumes, by: {title_of(objective)}"
         _print_rows(title, [each.row(objective) for each in candidates])
-    judgement = judge(final)
-    if judgement is None or judgement.of_chosen is None:
+    result = study_result(final)
+    if result is None or result.of_chosen is None:
         nothing = "final training has finished" if candidates else "trial is complete and satisfies all constraints"
-        if judgement is not None:
+        if result is not None:
             nothing = "training of the chosen configuration on the test volumes has finished"
         code, reason = 1, f"no {nothing}"
-        if not final.has_begun_all or final.n_unjudged:
+        if not final.has_begun_all or final.n_untested:
             code, reason = unfinished, "trainings are missing; the same command resumes the study"
         print_error(f"no final evaluation, because {reason}")
         return code
-    if judgement.differences:
-        _print_rows(judgement.compared, [each.row() for each in judgement.differences])
+    if result.differences:
+        _print_rows(result.compared, [each.row() for each in result.differences])
         print_sentence(HOW)
-    print_result_table("the test volumes", final_table(judgement.results), judgement.notes)
-    for name, settings in judgement.settings.items():
+    print_result_table("the test volumes", final_table(result.results), result.notes)
+    for name, settings in result.settings.items():
         print_sentence(f"{name}: {settings or NOTHING_SEARCHED}")
-    print_sentence(f"result: {judgement.result}")
-    if n_left := final.n_unjudged:
+    print_sentence(f"result: {result.summary}")
+    if n_left := final.n_untested:
         print_error(f"trainings on the test volumes are missing ({n_left}); the same command resumes the study")
         return os.EX_TEMPFAIL
     return unfinished if blocked else 0

@@ -13,8 +13,8 @@ from optuna.trial import FrozenTrial, TrialState
 
 from armscan.reports.html import Row
 from armscan.sweeps.results.final_results import ConfigResult
-from armscan.sweeps.results.judgement import Judgement
 from armscan.sweeps.results.selection import Candidate, score_rows
+from armscan.sweeps.results.study_result import StudyResult
 from armscan.sweeps.scheduling.population import searched_values
 from armscan.sweeps.scheduling.state import TEST_PREFIX, comparable_trials, is_feasible, seconds_of, was_retried
 from armscan.sweeps.space.parameter import overrides_of
@@ -43,7 +43,7 @@ def all_numbers(
     trials: Sequence[FrozenTrial],
     found: Sequence[ConfigResult],
     candidates: Sequence[Candidate],
-    judgement: Judgement | None,
+    result: StudyResult | None,
 ) -> dict[str, list[Row]]:
     """Return the tables by the names of their files.
 
@@ -52,7 +52,7 @@ def all_numbers(
         trials: Its trials.
         found: Results on the test volumes; empty without a final evaluation.
         candidates: Candidates of the selection; empty without one.
-        judgement: Judgement of the chosen configuration; None before one was chosen.
+        result: Result of the study; None before one was chosen.
     """
     objectives = list(study.user_attrs[OBJECTIVES])
     return {
@@ -74,7 +74,7 @@ def all_numbers(
         "result": list(_result_rows(found)),
         "importances": _importance_rows(study, objectives),
         "selection": [*score_rows(candidates)],
-        "differences": [*_difference_rows(judgement)] if judgement is not None else [],
+        "differences": [*_difference_rows(result)] if result is not None else [],
     }
 
 
@@ -123,12 +123,12 @@ def _ending_rows(trials: Sequence[FrozenTrial]) -> list[Row]:
     ]
 
 
-def _difference_rows(judgement: Judgement) -> Iterator[Row]:
-    for each in judgement.differences:
+def _difference_rows(result: StudyResult) -> Iterator[Row]:
+    for each in result.differences:
         yield {
-            "chosen": key_of(judgement.chosen),
+            "chosen": key_of(result.chosen),
             "metric": f"{TEST_PREFIX}{each.metric}",
-            "seeds": judgement.n_seeds,
+            "seeds": result.n_seeds,
             **dict(zip(("difference", "low", "high"), each.estimate, strict=True)),
             **dict(zip(("probability", "probability_low", "probability_high"), each.probability, strict=True)),
         }

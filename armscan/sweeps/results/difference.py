@@ -56,7 +56,7 @@ class Difference(NamedTuple):
         return self.paired.if_wide
 
     @property
-    def verdict(self) -> str:
+    def direction(self) -> str:
         """Return `better` or `worse` according to the interval; empty if it includes 0, or there is none."""
         above, below = ("better", "worse") if self.is_higher_better else ("worse", "better")
         return above if self.estimate.low > 0 else below if self.estimate.high < 0 else ""

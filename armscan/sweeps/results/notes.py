@@ -20,7 +20,7 @@ def code_notes(study: optuna.Study, what: str) -> list[str]:
     """Return a note if different versions of armscan's code ran the finished trials of a study.
 
     Args:
-        study: A study, or the selection or judgement of one.
+        study: A study, or the selection or test of one.
         what: The trials, as the note calls them.
     """
     leases = (trial.user_attrs.get(LEASE, {}) for trial in study.get_trials(deepcopy=False, states=FINISHED))

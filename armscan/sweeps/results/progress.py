@@ -27,7 +27,7 @@ from armscan.sweeps.storage.attribute_names import (
     LEASE,
     STOP,
 )
-from armscan.sweeps.storage.attributes import JUDGEMENT_SUFFIX
+from armscan.sweeps.storage.attributes import TEST_SUFFIX
 from armscan.sweeps.study.candidates import name_of
 from armscan.sweeps.study.final_eval import FinalEvaluation
 from armscan.sweeps.study.phase import OpenedStudy, Phase
@@ -130,10 +130,10 @@ def _table(opened: OpenedStudy) -> Table:
 def final_line(settings: StudySettings, final: FinalEvaluation, n_done: Sequence[int]) -> str:
     """Return the state of the final evaluation in one line."""
     _, n_left = final_trainings_left(settings, final, n_left=0)
-    race, (n_selected, n_judged) = final.race(), n_done
+    race, (n_selected, n_tested) = final.race(), n_done
     number, now = (race.leader, "has the best mean so far") if race.chosen is None else (race.chosen, "chosen")
     stands = "" if number is None else f"; {name_of(number)} {now}"
-    done = f"{n_selected} selection and {n_judged} judgement trainings done"
+    done = f"{n_selected} selection and {n_tested} test trainings done"
     return f"final evaluation: {done}, at most {n_left} left{stands}"
 
 
@@ -161,7 +161,7 @@ def _describe(trial: FrozenTrial, phase: Phase) -> str:
     """Return the outcome of a trial in one line."""
     attributes, tried = trial.user_attrs, " ".join(overrides_of(searched_values(trial)))
     name = f"trial {trial.number}"
-    what = "judgement" if phase.name.endswith(JUDGEMENT_SUFFIX) else "selection"
+    what = "test" if phase.name.endswith(TEST_SUFFIX) else "selection"
     if FINALIST in attributes:
         name = f"{what} of {name_of(attributes[FINALIST])} with seed {attributes[FINAL_SEED]}"
     if trial.state == TrialState.FAIL:

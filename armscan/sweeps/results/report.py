@@ -15,10 +15,10 @@ from armscan.sweeps.results.charts import charts_of
 from armscan.sweeps.results.csv_tables import all_numbers, cause_of
 from armscan.sweeps.results.difference import HOW
 from armscan.sweeps.results.final_results import ConfigResult, final_results, final_table
-from armscan.sweeps.results.judgement import Judgement, judge
 from armscan.sweeps.results.notes import notes_on
 from armscan.sweeps.results.population_charts import population_charts
 from armscan.sweeps.results.selection import candidates_of, decision_section
+from armscan.sweeps.results.study_result import StudyResult, study_result
 from armscan.sweeps.scheduling.state import CONTROL, StudyState, env_steps_of, is_feasible, was_retried
 from armscan.sweeps.scheduling.termination import REASON
 from armscan.sweeps.space.parameter import Value, overrides_of
@@ -69,17 +69,17 @@ def write_report(
     objectives = list(study.user_attrs[OBJECTIVES])
     trials, best = study.get_trials(deepcopy=False), best_trials(study, 1)
     state = StudyState.of(trials)
-    judgement = judge(final) if final is not None else None
+    result = study_result(final) if final is not None else None
     candidates = candidates_of(final) if final is not None else []
     # An earlier version evaluated its best configurations, without a control.
-    found = final_results(final_trials) if final is None else judgement.results if judgement is not None else ()
-    tables = all_numbers(study, trials, found, candidates, judgement)
+    found = final_results(final_trials) if final is None else result.results if result is not None else ()
+    tables = all_numbers(study, trials, found, candidates, result)
     parts = [
         _summary(study, state, best, objectives),
         "<h2>Result</h2>",
-        _judgement(judgement) if judgement is not None else "",
+        _comparison(result) if result is not None else "",
         _result(found, trials, final.control if final else None) if found else "<p>No final evaluation yet.</p>",
-        decision_section(final, judgement, candidates, state) if final is not None else "",
+        decision_section(final, result, candidates, state) if final is not None else "",
         _running(state.running),
         *population_charts(trials, objectives[0], *best or (None,)),
         *charts_of(study, trials, objectives, tables["importances"]),
@@ -195,15 +195,15 @@ def _videos(final_trials: Sequence[FrozenTrial]) -> str:
     return f"<h2>Episodes on a test volume</h2>{drawn}"
 
 
-def _judgement(judgement: Judgement) -> str:
+def _comparison(result: StudyResult) -> str:
     """Return the result in a sentence, and the differences from the control."""
-    notes = "".join(f"<p>Note: {html.escape(note)}.</p>" for note in judgement.notes)
-    said = f"<p><strong>{html.escape(judgement.result)}</strong></p>{notes}"
-    if not judgement.differences:
+    notes = "".join(f"<p>Note: {html.escape(note)}.</p>" for note in result.notes)
+    said = f"<p><strong>{html.escape(result.summary)}</strong></p>{notes}"
+    if not result.differences:
         return said
-    n_seeds = counted(judgement.n_seeds, "seed")
+    n_seeds = counted(result.n_seeds, "seed")
     seeds = f"Both were trained with the same {n_seeds}, which neither search nor selection has used."
-    return f"{said}{table([each.row() for each in judgement.differences])}<p>{HOW} {seeds}</p>"
+    return f"{said}{table([each.row() for each in result.differences])}<p>{HOW} {seeds}</p>"
 
 
 def _result(found: Sequence[ConfigResult], trials: Sequence[FrozenTrial], control: Mapping[str, Value] | None) -> str:

@@ -14,7 +14,7 @@ from armscan.reports.charts import add_estimate
 from armscan.reports.html import chart, table
 from armscan.stats.bootstrap import Estimate
 from armscan.sweeps.results.final_results import bounds_in
-from armscan.sweeps.results.judgement import Judgement
+from armscan.sweeps.results.study_result import StudyResult
 from armscan.sweeps.scheduling.race import END_LOSS, LEADER_SEEDS, Race
 from armscan.sweeps.scheduling.state import CONTROL, StudyState
 from armscan.sweeps.space.parameter import overrides_of
@@ -127,7 +127,7 @@ def score_rows(candidates: Sequence[Candidate]) -> Iterator[dict[str, Any]]:
 
 
 def decision_section(
-    final: FinalEvaluation, judgement: Judgement | None, candidates: Sequence[Candidate], searched: StudyState
+    final: FinalEvaluation, result: StudyResult | None, candidates: Sequence[Candidate], searched: StudyState
 ) -> str:
     """Return an explanation in HTML, step by step, of how a study decided."""
     objective, settings = objective_of(final), final.settings
@@ -154,11 +154,10 @@ def decision_section(
             else "The candidate with the best score is chosen: one seed gives no interval."
         ),
     ]
-    if judgement is not None:
-        judged = "the control alone" if judgement.chosen == CONTROL else f"{name_of(judgement.chosen)} and the control"
+    if result is not None:
+        tested = "the control alone" if result.chosen == CONTROL else f"{name_of(result.chosen)} and the control"
         steps.append(
-            f"<b>Judgement</b>, on the test volumes: {judged}, with {counted(settings.judge_seeds, 'seed')} of their "
-            "own."
+            f"<b>Test</b>, on the test volumes: {tested}, with {counted(settings.test_seeds, 'seed')} of their own."
         )
     listed = "".join(f"<li>{step}</li>" for step in steps)
     if not candidates:

@@ -10,7 +10,7 @@ from optuna.trial import FrozenTrial
 
 from armscan.sweeps.results.difference import HOW
 from armscan.sweeps.results.final_results import final_table
-from armscan.sweeps.results.judgement import Judgement
+from armscan.sweeps.results.study_result import StudyResult
 from armscan.sweeps.scheduling.state import CONTROL
 from armscan.sweeps.storage.attribute_names import MEMBER, METRICS, OBJECTIVES
 from armscan.sweeps.study.candidates import NOTHING_SEARCHED
@@ -26,7 +26,7 @@ from armscan.utils.text import markdown_table
 COMPARISONS = ("difference", "probability_of_improvement")
 
 
-def best_metrics(search: optuna.Study, judgement: Judgement | None) -> dict[str, float]:
+def best_metrics(search: optuna.Study, result: StudyResult | None) -> dict[str, float]:
     """Return the leading metrics of a study's result, by the names that runs use; before it has one, of its best trial.
 
     Metrics that are not there are NaN, in place of those of an earlier result, which MLflow cannot delete: validation
@@ -34,22 +34,22 @@ def best_metrics(search: optuna.Study, judgement: Judgement | None) -> dict[str,
 
     Args:
         search: Study of the search.
-        judgement: Its judgement; None without one.
+        result: Its result; None without one.
     """
     best = best_trials(search, 1)
     found = _of_search(best[0]) if best else {}
-    if judgement is None or (chosen := judgement.of_chosen) is None:
+    if result is None or (chosen := result.of_chosen) is None:
         return found
     found = dict.fromkeys(found, math.nan)
-    if judgement.chosen != CONTROL:
-        found |= _of_search(search.get_trials(deepcopy=False)[judgement.chosen])
+    if result.chosen != CONTROL:
+        found |= _of_search(search.get_trials(deepcopy=False)[result.chosen])
     of_chosen = chosen.figures.metrics()
     found |= _leading(TEST_METRICS, of_chosen)
     if (of_random := chosen.baselines.get(RANDOM)) is not None:
         found |= _leading(RANDOM, of_random.metrics())
     compared = (*(name for name in search.user_attrs[OBJECTIVES] if name in of_chosen), *leading_among(of_chosen))
     found |= dict.fromkeys((name for key in COMPARISONS for each in compared for name in _names(key, each)), math.nan)
-    for each in judgement.differences:
+    for each in result.differences:
         for key, estimate in zip(COMPARISONS, (each.estimate, each.probability), strict=True):
             found |= dict(zip(_names(key, each.metric), estimate, strict=True))
     return found
@@ -71,12 +71,12 @@ def _names(key: str, metric: str) -> list[str]:
     return [f"{key}/{metric}{end}" for end in ("", *ENDS)]
 
 
-def result_note(judgement: Judgement | None) -> str:
-    """Return the result of a study in Markdown, as the study prints it; empty before a configuration was judged."""
-    if judgement is None or judgement.of_chosen is None:
+def result_note(result: StudyResult | None) -> str:
+    """Return the result of a study in Markdown, as the study prints it; empty before a configuration was tested."""
+    if result is None or result.of_chosen is None:
         return ""
-    settings = (f"{name}: {f'`{each}`' if each else NOTHING_SEARCHED}" for name, each in judgement.settings.items())
-    parts = [f"**{judgement.result}**", *settings, "The test volumes:", final_table(judgement.results).markdown()]
-    if rows := [each.row() for each in judgement.differences]:
-        parts += [f"{judgement.compared}:", markdown_table([*rows[0]], [[*row.values()] for row in rows]), HOW]
-    return "\n\n".join([*parts, *(f"Note: {note}." for note in judgement.notes)])
+    settings = (f"{name}: {f'`{each}`' if each else NOTHING_SEARCHED}" for name, each in result.settings.items())
+    parts = [f"**{result.summary}**", *settings, "The test volumes:", final_table(result.results).markdown()]
+    if rows := [each.row() for each in result.differences]:
+        parts += [f"{result.compared}:", markdown_table([*rows[0]], [[*row.values()] for row in rows]), HOW]
+    return "\n\n".join([*parts, *(f"Note: {note}." for note in result.notes)])

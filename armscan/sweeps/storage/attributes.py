@@ -17,8 +17,8 @@ from armscan.utils.section import Section
 from armscan.utils.validation import MAX_SEED, is_finite
 
 # Suffixes to a study's name for the studies of its final trainings: those that select a configuration, and those that
-# judge it.
-SELECTION_SUFFIX, JUDGEMENT_SUFFIX = FINAL_SUFFIXES = ("-selection", "-judged")
+# test it.
+SELECTION_SUFFIX, TEST_SUFFIX = FINAL_SUFFIXES = ("-selection", "-judged")
 # Errors that Optuna raises when it reads data that it has not written.
 DAMAGED = (ValueError, TypeError, AttributeError, AssertionError)
 UNREADABLE = (*DAMAGED, LookupError)

@@ -1,4 +1,4 @@
-"""The final evaluation of a study: which trainings are missing, which configuration is selected, which seeds judge it.
+"""The final evaluation of a study: which trainings are missing, which configuration is selected, which seeds test it.
 
 All of it is derived from the storage. The candidates race on the validation volumes; only the chosen one and the
 control are evaluated on the test volumes, with other seeds.
@@ -37,8 +37,8 @@ from armscan.sweeps.study.candidates import attributes_of, settings_of, training
 from armscan.sweeps.study.constraints import Constraint
 from armscan.sweeps.study.fixed_config import CONSTRAINTS
 from armscan.sweeps.study.settings import (
-    JUDGEMENT_SEEDS_ABOVE,
     SELECTION_SEEDS_ABOVE,
+    TEST_SEEDS_ABOVE,
     FinalEvalSettings,
 )
 from armscan.sweeps.study.study import best_trials
@@ -57,7 +57,7 @@ class FinalEvaluation:
         control: Values of the control by the searched keys; None if they do not lie in the space.
         search: The study of the search.
         selection: The study of the trainings that choose a configuration.
-        judgement: The study of the trainings that judge it.
+        test: The study of the trainings on the test volumes.
         config_sha256: `config_sha256_of` of the study, as its trainings have it here.
     """
 
@@ -66,7 +66,7 @@ class FinalEvaluation:
     control: Mapping[str, Value] | None
     search: optuna.Study
     selection: optuna.Study
-    judgement: optuna.Study
+    test: optuna.Study
     config_sha256: str
 
     @property
@@ -76,10 +76,10 @@ class FinalEvaluation:
         return range(first, first + MAX_SEEDS_FACTOR * self.settings.mean_seeds)
 
     @property
-    def judge_seeds(self) -> range:
-        """The seeds of the judgement; neither the search nor the selection has used one."""
-        first = self.search_seed + JUDGEMENT_SEEDS_ABOVE
-        return range(first, first + self.settings.judge_seeds)
+    def test_seeds(self) -> range:
+        """The seeds of the test; neither the search nor the selection has used one."""
+        first = self.search_seed + TEST_SEEDS_ABOVE
+        return range(first, first + self.settings.test_seeds)
 
     @property
     def sign(self) -> float:
@@ -156,42 +156,42 @@ class FinalEvaluation:
 
     @property
     def has_begun_all(self) -> bool:
-        """Whether the selection has ended, with or without a choice, and all trainings of the judgement have begun."""
-        return self.race().is_over and not self.missing_of_judgement()
+        """Whether the selection has ended, with or without a choice, and all trainings of the test have begun."""
+        return self.race().is_over and not self.missing_of_test()
 
-    def missing_of_judgement(self) -> list[PlannedTrial]:
-        """Return the trainings of the judgement that no worker has begun; during the selection, those of the control.
+    def missing_of_test(self) -> list[PlannedTrial]:
+        """Return the trainings of the test that no worker has begun; during the selection, those of the control.
 
-        The control is always judged, so idle workers train it before the race ends.
+        The control is always tested, so idle workers train it before the race ends.
         """
-        return self._planned(self.trainings_of_judgement(self.race()), self.judgement)
+        return self._planned(self.trainings_of_test(self.race()), self.test)
 
-    def trainings_of_judgement(self, race: Race) -> list[tuple[int, int]]:
-        """Return the trainings of the judgement, as far as they are known: pairs of a configuration and a seed."""
-        return [(number, seed) for seed in self.judge_seeds for number in to_judge(race)]
+    def trainings_of_test(self, race: Race) -> list[tuple[int, int]]:
+        """Return the trainings of the test, as far as they are known: pairs of a configuration and a seed."""
+        return [(number, seed) for seed in self.test_seeds for number in to_test(race)]
 
     @property
-    def n_unjudged(self) -> int:
-        """Number of trainings of the judgement, as far as they are known, that have not ended."""
+    def n_untested(self) -> int:
+        """Number of trainings of the test, as far as they are known, that have not ended."""
         ended = {
             training_of(trial)
-            for trial in self._counted_trials(self.judgement)
+            for trial in self._counted_trials(self.test)
             if trial.state.is_finished() and RETRIED not in trial.user_attrs
         }
-        return len(set(self.trainings_of_judgement(self.race())) - ended)
+        return len(set(self.trainings_of_test(self.race())) - ended)
 
-    def judged(self) -> dict[tuple[int, int], FrozenTrial]:
-        """Return the complete trainings of the judgement, by configuration and seed."""
-        counted = self._counted_trials(self.judgement)
+    def tested(self) -> dict[tuple[int, int], FrozenTrial]:
+        """Return the complete trainings of the test, by configuration and seed."""
+        counted = self._counted_trials(self.test)
         return {training_of(trial): trial for trial in counted if trial.state == TrialState.COMPLETE}
 
     def blocked(self) -> list[str]:
-        """Return the names of the studies that failed trainings block: without a choice, or a seed of the judgement."""
+        """Return the names of the studies that failed trainings block: without a choice, or a seed of the test."""
         race = self.race()
-        wanted, ended = self.trainings_of_judgement(race), filter(_has_no_score, self._counted_trials(self.judgement))
+        wanted, ended = self.trainings_of_test(race), filter(_has_no_score, self._counted_trials(self.test))
         is_blocked = {
             self.selection.study_name: race.is_over and race.chosen is None,
-            self.judgement.study_name: any(training_of(trial) in wanted for trial in ended),
+            self.test.study_name: any(training_of(trial) in wanted for trial in ended),
         }
         return [name for name in is_blocked if is_blocked[name]]
 
@@ -213,9 +213,9 @@ class FinalEvaluation:
         """Return the waiting trainings of the selection that it no longer needs; see `TrialScheduler`."""
         return self._unwanted(waiting, self.contenders() if waiting else ())
 
-    def unwanted_of_judgement(self, waiting: Sequence[FrozenTrial]) -> list[FrozenTrial]:
-        """Return the waiting trainings of the judgement that it no longer needs; see `TrialScheduler`."""
-        return self._unwanted(waiting, to_judge(self.race()) if waiting else ())
+    def unwanted_of_test(self, waiting: Sequence[FrozenTrial]) -> list[FrozenTrial]:
+        """Return the waiting trainings of the test that it no longer needs; see `TrialScheduler`."""
+        return self._unwanted(waiting, to_test(self.race()) if waiting else ())
 
     def _unwanted(self, waiting: Sequence[FrozenTrial], wanted: Collection[int]) -> list[FrozenTrial]:
         return [trial for trial in waiting if not self.is_current(trial) or training_of(trial)[0] not in wanted]
@@ -244,7 +244,7 @@ def config_sha256_of(search: optuna.Study) -> str:
     return sha256(json.dumps(search.user_attrs.get(FIXED), sort_keys=True).encode())
 
 
-def to_judge(race: Race) -> list[int]:
+def to_test(race: Race) -> list[int]:
     """Return the configurations to evaluate on the test volumes: the chosen one and the control.
 
     The control alone while the race continues; none if nothing was chosen.
@@ -262,4 +262,4 @@ def n_trainings(settings: FinalEvalSettings) -> tuple[int, int]:
     if not settings.top_k:
         return 0, 0
     fewest, most = budget(settings.top_k + 1, min_seeds=settings.min_seeds, mean_seeds=settings.mean_seeds)
-    return fewest + settings.judge_seeds, most + 2 * settings.judge_seeds
+    return fewest + settings.test_seeds, most + 2 * settings.test_seeds

@@ -1,4 +1,4 @@
-"""Where a final evaluation is stored: the studies of its selection and judgement, and its settings."""
+"""Where a final evaluation is stored: the studies of its selection and test, and its settings."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pydantic import Field
 
 from armscan.errors import StudyError
 from armscan.sweeps.space.parameter import Value
-from armscan.sweeps.storage.attributes import FINAL_SUFFIXES, JUDGEMENT_SUFFIX, SELECTION_SUFFIX, check_trials
+from armscan.sweeps.storage.attributes import FINAL_SUFFIXES, SELECTION_SUFFIX, TEST_SUFFIX, check_trials
 from armscan.sweeps.storage.storage import Storage
 from armscan.sweeps.study.final_eval import FinalEvaluation, config_sha256_of
 from armscan.sweeps.study.settings import MAX_SEARCH_SEED, FinalEvalSettings, StudySettings
@@ -60,18 +60,18 @@ def open_final_eval(
     }
     if selection.user_attrs.get(FINAL_EVAL) != stored:
         selection.set_user_attr(FINAL_EVAL, stored)
-    judgement = make(JUDGEMENT_SUFFIX, [StudyDirection.MINIMIZE])
+    test = make(TEST_SUFFIX, [StudyDirection.MINIMIZE])
     return FinalEvaluation(
-        settings.final_eval, max(settings.seeds), control, search, selection, judgement, config_sha256_of(search)
+        settings.final_eval, max(settings.seeds), control, search, selection, test, config_sha256_of(search)
     )
 
 
 def stored_final_eval(storage: Storage, search: optuna.Study) -> FinalEvaluation | None:
     """Return the final evaluation of a stored study; None if none was begun, or an earlier version made it."""
-    selection, judgement = (storage.study(search.study_name + suffix) for suffix in FINAL_SUFFIXES)
-    if selection is None or judgement is None:
+    selection, test = (storage.study(search.study_name + suffix) for suffix in FINAL_SUFFIXES)
+    if selection is None or test is None:
         return None
-    for study in (selection, judgement):
+    for study in (selection, test):
         check_trials(study, n_searched=len(search.get_trials(deepcopy=False)))
     where, found = f"{selection.study_name}.user_attrs.{FINAL_EVAL}", selection.user_attrs.get(FINAL_EVAL)
     if not isinstance(found, Mapping):
@@ -82,5 +82,5 @@ def stored_final_eval(storage: Storage, search: optuna.Study) -> FinalEvaluation
         return None
     kept = _Stored.read(where, found)
     return FinalEvaluation(
-        kept.settings, kept.search_seed, kept.control, search, selection, judgement, config_sha256_of(search)
+        kept.settings, kept.search_seed, kept.control, search, selection, test, config_sha256_of(search)
     )

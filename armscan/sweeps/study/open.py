@@ -220,7 +220,7 @@ def _final_phases(search: Phase, settings: StudySettings, task: Task, final: Fin
     )
     scheduler = partial(TrialScheduler, storage=search.scheduler.storage, limits=limits, is_current=final.is_current)
     name_objectives(final.selection, search.objectives)
-    name_objectives(final.judgement, [task.final_metric])
+    name_objectives(final.test, [task.final_metric])
     return (
         shared(
             name=final.selection.study_name,
@@ -229,8 +229,8 @@ def _final_phases(search: Phase, settings: StudySettings, task: Task, final: Fin
             folder=search.folder / "selection",
         ),
         shared(
-            name=final.judgement.study_name,
-            scheduler=scheduler(final.judgement, plan=final.missing_of_judgement, unwanted=final.unwanted_of_judgement),
+            name=final.test.study_name,
+            scheduler=scheduler(final.test, plan=final.missing_of_test, unwanted=final.unwanted_of_test),
             objectives=(task.final_metric,),
             run=task.evaluate,
             folder=search.folder / "judged",

@@ -127,7 +127,7 @@ class OpenedStudy:
         config: Configuration of its trials, without the searched values.
         search: Phase that searches configurations.
         final_eval: Final evaluation; None without one.
-        finals: Phases of the final evaluation, which select a configuration and judge it; none without one.
+        finals: Phases of the final evaluation, which select a configuration and test it; none without one.
     """
 
     settings: StudySettings

@@ -167,15 +167,15 @@ def final_trainings_left(settings: StudySettings, final: FinalEvaluation | None,
         return min(fewest, final_trainings_left(settings, final, n_left=0)[0]), most
     final = replace(final, settings=settings.final_eval)
     race = final.race()
-    wanted = set(final.trainings_of_judgement(race))
-    n_judged = len(wanted & final.judged().keys())
+    wanted = set(final.trainings_of_test(race))
+    n_tested = len(wanted & final.tested().keys())
     if race.is_over:
-        return len(wanted) - n_judged, len(wanted) - n_judged
+        return len(wanted) - n_tested, len(wanted) - n_tested
     asked = settings.final_eval
     n_racing = sum(not each.is_withdrawn for each in race.standings.values())
     bounds = budget(n_racing, min_seeds=asked.min_seeds, mean_seeds=asked.mean_seeds)
-    least, most = (max(bound - race.n_trained, len(race.missing)) - n_judged for bound in bounds)
-    return least + asked.judge_seeds, most + 2 * asked.judge_seeds
+    least, most = (max(bound - race.n_trained, len(race.missing)) - n_tested for bound in bounds)
+    return least + asked.test_seeds, most + 2 * asked.test_seeds
 
 
 def _final(settings: FinalEvalSettings) -> str:
@@ -189,7 +189,7 @@ def _final(settings: FinalEvalSettings) -> str:
     return (
         f"at most {most} final trainings, and with {candidates} at least {fewest}: the candidates and the control with "
         f"{counted(n_first, 'seed')} each{further} to select one, then that one and the control with "
-        f"{settings.judge_seeds} more each on the test volumes"
+        f"{settings.test_seeds} more each on the test volumes"
     )
 
 

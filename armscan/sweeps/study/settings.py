@@ -21,10 +21,10 @@ from armscan.utils.text import counted
 from armscan.utils.validation import MAX_SEED
 
 NAME = re.compile(rf"(?!.*(?:{'|'.join(FINAL_SUFFIXES)})$)\w[\w\-.]{{0,99}}")
-# Distances of the first selection seed and the first judgement seed from the largest search seed, and the maximum
+# Distances of the first selection seed and the first test seed from the largest search seed, and the maximum
 # number of seeds of a configuration in each.
-SELECTION_SEEDS_ABOVE, JUDGEMENT_SEEDS_ABOVE, MAX_FINAL_SEEDS = 1000, 2000, 1000
-MAX_SEARCH_SEED = MAX_SEED - JUDGEMENT_SEEDS_ABOVE - MAX_FINAL_SEEDS
+SELECTION_SEEDS_ABOVE, TEST_SEEDS_ABOVE, MAX_FINAL_SEEDS = 1000, 2000, 1000
+MAX_SEARCH_SEED = MAX_SEED - TEST_SEEDS_ABOVE - MAX_FINAL_SEEDS
 T = TypeVar("T")
 OPTUNA_PRUNERS = "optuna.pruners."
 NO_PRUNER = f"{OPTUNA_PRUNERS}NopPruner"
@@ -89,7 +89,7 @@ MeanSeeds = Annotated[int, Field(ge=1, le=MAX_MEAN_SEEDS, description=f"a whole 
 class FinalEvalSettings(Section):
     """Settings of the final evaluation, which selects one of the best configurations and compares it with the control.
 
-    The control is the configuration of the study without the searched values. The selection and the judgement have
+    The control is the configuration of the study without the searched values. The selection and the test have
     seeds of their own, which the search does not use.
 
     Args:
@@ -99,7 +99,7 @@ class FinalEvalSettings(Section):
             `mean_seeds`.
         mean_seeds: Maximum number of seeds of each on average in the whole selection, from 1 to 250; those that may be
             the best get more than others, but at most four times this number.
-        judge_seeds: Number of seeds of the chosen configuration, and of the control, on the test volumes, from 1 to
+        test_seeds: Number of seeds of the chosen configuration, and of the control, on the test volumes, from 1 to
             1000.
         episodes: Number of episodes of each evaluation of a final training, 1 or more. Default: None, as many as
             `evaluation.episodes`.
@@ -108,17 +108,16 @@ class FinalEvalSettings(Section):
     top_k: int = Field(ge=0, description="a whole number of at least 0")
     min_seeds: MeanSeeds
     mean_seeds: MeanSeeds
-    judge_seeds: SeedCount
+    test_seeds: SeedCount
     episodes: int | None = Field(default=None, ge=1, description="a whole number of at least 1, or null")
 
     @model_validator(mode="before")
     @classmethod
     def _of_earlier_versions(cls, values: Any) -> Any:
-        """Take `n_seeds` of a sweep that was written for an earlier version as `judge_seeds`."""
-        if not isinstance(values, Mapping) or "n_seeds" not in values:
+        """Take `n_seeds` or `judge_seeds` of a sweep that was written for an earlier version as `test_seeds`."""
+        if not isinstance(values, Mapping):
             return values
-        kept = {key: value for key, value in values.items() if key != "n_seeds"}
-        return kept | {"judge_seeds": values["n_seeds"]}
+        return {"test_seeds" if key in ("n_seeds", "judge_seeds") else key: value for key, value in values.items()}
 
     @model_validator(mode="after")
     def _fewest_first(self) -> Self:

@@ -81,7 +81,7 @@ class LandmarksTask:
         for name, volume in volumes[part].items():
             scorer, labelled = PlaneScorer(volume, reward, tissues), volume.optimal_action
             if labelled is None:
-                raise InvalidValueError(f"{volume.name}: has no labelled plane, which clusterings are judged by")
+                raise InvalidValueError(f"{volume.name}: has no labelled plane, which clusterings are compared by")
             tx_mm, ty_mm = labelled.translation
             places = np.arange(0.0, volume.size_mm[1], STEP_MM)
             far = [place for place in places if abs(place - ty_mm) > NEAR_MM]

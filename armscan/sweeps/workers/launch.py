@@ -18,8 +18,8 @@ from armscan.config.literal import hydra_literal
 from armscan.config.sources import working_folder
 from armscan.errors import ArmscanError, print_error, reason_of
 from armscan.launch.launchers import ON_THIS_MACHINE, launcher_error, prepare_launcher
-from armscan.sweeps.results.judgement import judge
 from armscan.sweeps.results.progress import progress_display
+from armscan.sweeps.results.study_result import study_result
 from armscan.sweeps.results.study_run import best_metrics, result_note
 from armscan.sweeps.study.arguments import DEFAULT_LAUNCHER, STORAGE, WORKER_KEY, StudyCommand, fixed_by
 from armscan.sweeps.study.dashboard import note_run
@@ -192,11 +192,11 @@ def _conclude(opened: OpenedStudy, tracked: TrackedRun, monitor: StudyMonitor) -
         # Workers of another command may go on with it.
         is_left = not (monitor.is_over() or monitor.is_worked_on())
         search = opened.search.scheduler.study
-        judgement = judge(opened.final_eval) if opened.final_eval is not None else None
-        note = result_note(judgement)
+        result = study_result(opened.final_eval) if opened.final_eval is not None else None
+        note = result_note(result)
         # While a study that goes on has no new result, its run keeps all of the earlier one.
         if note or not _has_result(opened):
-            tracked.log_metrics(best_metrics(search, judgement), n_env_steps=0, keeps_nan=True)
+            tracked.log_metrics(best_metrics(search, result), n_env_steps=0, keeps_nan=True)
         if note:
             tracked.set_description(note)
             note_run(

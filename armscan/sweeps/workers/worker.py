@@ -223,7 +223,7 @@ def work(overrides: Sequence[str], make_heartbeat: Callable[..., Heartbeat]) -> 
             return Worker(phase, overrides, heartbeat, None if other is None else other.scheduler).work()
 
     for phase in opened.phases:
-        # While the selection waits for other workers, this one trains the control for the judgement.
+        # While the selection waits for other workers, this one trains the control for the test.
         other = opened.finals[1] if opened.finals and phase is opened.finals[0] else None
         while (reason := run_phase(phase, other)) is None:
             assert other is not None

@@ -14,7 +14,7 @@ from armscan.sweeps.study.settings import FinalEvalSettings
 
 @pytest.fixture
 def study(opened):
-    return opened(final_eval=FinalEvalSettings(top_k=1, min_seeds=1, mean_seeds=1, judge_seeds=1, episodes=3))
+    return opened(final_eval=FinalEvalSettings(top_k=1, min_seeds=1, mean_seeds=1, test_seeds=1, episodes=3))
 
 
 @pytest.fixture
@@ -35,7 +35,7 @@ def test_study_whose_workers_have_ended_before_its_trials_can_be_resumed(study, 
 
 def test_limit_that_ended_the_search_is_named(opened, capsys):
     study = opened(
-        max_env_steps=100, final_eval=FinalEvalSettings(top_k=0, min_seeds=1, mean_seeds=1, judge_seeds=1, episodes=3)
+        max_env_steps=100, final_eval=FinalEvalSettings(top_k=0, min_seeds=1, mean_seeds=1, test_seeds=1, episodes=3)
     )
     trial = study.search.scheduler.claim({})
     trial.set_user_attr(ENV_STEPS, 120)
@@ -50,8 +50,8 @@ def test_study_whose_final_trainings_are_missing_can_be_resumed(searched, capsys
     assert "trainings are missing; the same command resumes the study" in capsys.readouterr().err
 
 
-def test_study_whose_judgement_is_incomplete_can_be_resumed(searched, capsys):
-    selection, judgement = (phase.scheduler for phase in searched.finals)
+def test_study_whose_test_is_incomplete_can_be_resumed(searched, capsys):
+    selection, test = (phase.scheduler for phase in searched.finals)
 
     def train(scheduler):
         if trial := scheduler.claim({}):
@@ -62,7 +62,7 @@ def test_study_whose_judgement_is_incomplete_can_be_resumed(searched, capsys):
     while train(selection):
         pass
     for n_left, code in ((1, os.EX_TEMPFAIL), (0, 0)):
-        assert train(judgement)
+        assert train(test)
         assert print_result(searched) == code
         assert (f"trainings on the test volumes are missing ({n_left}); the" in capsys.readouterr().err) == bool(code)
 
@@ -75,9 +75,9 @@ def test_failed_study_is_not_worth_the_same_command(study):
 
 
 def test_study_with_a_failed_final_training_is_not_worth_the_same_command(searched):
-    judgement = searched.finals[1].scheduler.study
-    failed = judgement.ask()
+    test = searched.finals[1].scheduler.study
+    failed = test.ask()
     failed.set_user_attr(FINALIST, CONTROL)
     failed.set_user_attr(FINAL_SEED, 0)
-    judgement.tell(failed, state=TrialState.FAIL)
+    test.tell(failed, state=TrialState.FAIL)
     assert print_result(searched) == 1

@@ -2,7 +2,7 @@
 
 import pytest
 
-from benchmarks.sweeps.judgement import simulate
+from benchmarks.sweeps.result_intervals import simulate
 
 
 @pytest.mark.parametrize(

@@ -7,16 +7,16 @@ import pytest
 from armscan.stats.bootstrap import Estimate
 from armscan.sweeps.results.csv_tables import _difference_rows, _importance_rows, all_numbers
 from armscan.sweeps.results.difference import Difference
-from armscan.sweeps.results.judgement import Judgement
+from armscan.sweeps.results.study_result import StudyResult
 from armscan.sweeps.storage.attribute_names import FAILURE, OBJECTIVES, RETRIED, RETRY_OF
 
 
 def test_differences_have_the_probability_beside_the_difference():
     difference = Difference("success_rate", True, Estimate(0.1, 0.0, 0.2), Estimate(0.7, 0.5, 0.9))
-    judgement = Judgement(
+    result = StudyResult(
         chosen=3, results=(), differences=(difference,), n_seeds=2, n_planned=2, others=(), settings={}
     )
-    (row,) = _difference_rows(judgement)
+    (row,) = _difference_rows(result)
     assert [row[name] for name in ("probability", "probability_low", "probability_high")] == [0.7, 0.5, 0.9]
 
 
@@ -28,7 +28,7 @@ def test_reports_of_a_retried_trial_are_those_of_its_retry_alone():
         trial = study.ask()
         trial.report(3.0, 100)
         study.tell(trial, 3.0)
-    rows = all_numbers(study, study.trials, found=(), candidates=(), judgement=None)["reports"]
+    rows = all_numbers(study, study.trials, found=(), candidates=(), result=None)["reports"]
     assert rows == [{"trial": 1, "step": 100, "objective": "steps", "value": 3.0}]
 
 
@@ -38,7 +38,7 @@ def test_retried_trials_are_told_from_failed_ones():
     for attributes in ({RETRIED: True, FAILURE: "its worker died"}, {FAILURE: "its worker died"}):
         study.enqueue_trial({}, user_attrs=attributes)
         study.tell(study.ask(), state=optuna.trial.TrialState.FAIL)
-    rows = all_numbers(study, study.trials, found=(), candidates=(), judgement=None)
+    rows = all_numbers(study, study.trials, found=(), candidates=(), result=None)
     assert [row["retried"] for row in rows["trials"]] == [True, False]
     assert [row["cause"] for row in rows["failures"]] == ["its worker died, retried", "its worker died"]
     assert [row["cause"] for row in rows["endings"]] == ["its worker died", "its worker died, retried"]

@@ -15,7 +15,7 @@ from armscan.training import Evaluation
 from tests.training.test_result_table import made_episodes, recomputed
 
 
-def judged(number, metrics, state=TrialState.COMPLETE):
+def training(number, metrics, state=TrialState.COMPLETE):
     value = 0.0 if state == TrialState.COMPLETE else None
     return create_trial(state=state, value=value, user_attrs={FINALIST: number, METRICS: metrics})
 
@@ -25,9 +25,9 @@ def figures_of(of_volumes):
     return metrics | {f"test/volume/v{i}/mean_steps": value for i, value in enumerate(of_volumes)}
 
 
-def test_verdict_is_over_seeds_and_test_volumes():
+def test_result_is_over_seeds_and_test_volumes():
     scores = np.random.default_rng(0).gamma(2.0, 2.0, (5, 8))
-    (result,) = final_results([judged(7, figures_of(list(of_seed))) for of_seed in scores])
+    (result,) = final_results([training(7, figures_of(list(of_seed))) for of_seed in scores])
     assert (result.number, result.figures.n_seeds, result.figures.n_volumes) == (7, 5, 8)
     assert result.figures.estimates.keys() == {"mean_steps", "success_rate"}
     mean, low, high = result.figures.estimates["mean_steps"]
@@ -40,7 +40,7 @@ def test_verdict_is_over_seeds_and_test_volumes():
 
 def test_volumes_of_one_subject_count_as_one_also_without_episodes():
     scores, subjects = np.array([[1.0, 1.2, 3.0, 3.4]] * 2), {"v0": "a", "v1": "a", "v2": "b", "v3": "b"}
-    trials = [judged(0, figures_of(list(of_seed))) for of_seed in scores]
+    trials = [training(0, figures_of(list(of_seed))) for of_seed in scores]
     (alone,) = final_results(trials)
     for trial in trials:
         trial.system_attrs = {SUBJECTS: subjects}
@@ -53,38 +53,38 @@ def test_volumes_of_one_subject_count_as_one_also_without_episodes():
         final_results(trials)
 
 
-def test_verdict_of_the_same_trials_is_the_same_and_lacks_those_that_have_not_finished():
+def test_result_of_the_same_trials_is_the_same_and_lacks_those_that_have_not_finished():
     scores = np.random.default_rng(0).gamma(2.0, 2.0, (2, 6, 8))
-    trials = [judged(number, figures_of(list(scores[number - 1, seed]))) for number in (1, 2) for seed in range(6)]
-    trials.append(judged(2, figures_of([0.0]), TrialState.FAIL))
+    trials = [training(number, figures_of(list(scores[number - 1, seed]))) for number in (1, 2) for seed in range(6)]
+    trials.append(training(2, figures_of([0.0]), TrialState.FAIL))
     first, second = final_results(trials), final_results(trials)
     assert first == second
     assert [result.figures.n_seeds for result in first] == [6, 6]
 
 
-def test_verdict_of_one_seed_has_no_interval():
-    (result,) = final_results([judged(0, figures_of([2.0]))])
+def test_result_of_one_seed_has_no_interval():
+    (result,) = final_results([training(0, figures_of([2.0]))])
     mean, low, high = result.figures.estimates["mean_steps"]
     assert mean == 2.0
     assert np.isnan([low, high]).all()
 
 
-def test_verdict_leaves_out_figures_that_some_seeds_lack():
-    uneven = [judged(0, figures_of([2.0]) | {f"test/only_{seed}": 1.0}) for seed in range(2)]
+def test_result_leaves_out_figures_that_some_seeds_lack():
+    uneven = [training(0, figures_of([2.0]) | {f"test/only_{seed}": 1.0}) for seed in range(2)]
     (result,) = final_results(uneven)
     assert result.figures.estimates.keys() == {"mean_steps", "success_rate"}
 
 
-def test_verdict_leaves_the_draws_of_others_alone():
+def test_result_leaves_the_draws_of_others_alone():
     before = np.random.get_bit_generator().state
-    (result,) = final_results([judged(0, figures_of([float(seed), 3.0])) for seed in range(3)])
+    (result,) = final_results([training(0, figures_of([float(seed), 3.0])) for seed in range(3)])
     assert result.figures.n_seeds == 3
     np.testing.assert_equal(np.random.get_bit_generator().state, before)
 
 
-def test_verdict_on_one_volume_has_the_interval_of_student():
+def test_result_on_one_volume_has_the_interval_of_student():
     scores = np.random.default_rng(0).gamma(2.0, 2.0, (20, 1))
-    (result,) = final_results([judged(7, figures_of(list(of_seed))) for of_seed in scores])
+    (result,) = final_results([training(7, figures_of(list(of_seed))) for of_seed in scores])
     expected = ttest_1samp(scores[:, 0], 0.0).confidence_interval()
     assert result.figures.estimates["mean_steps"][1:] == pytest.approx(expected)
 

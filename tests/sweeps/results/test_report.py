@@ -47,7 +47,7 @@ def searched(folder, objectives, n_trials=6):
     return storage
 
 
-def judge(storage, folder):
+def add_final_trainings(storage, folder):
     study = optuna.create_study(study_name="a-judged", storage=storage.optuna)
     for seed in range(3):
         study.enqueue_trial({}, user_attrs={"judged": 0, "judged_seed": seed})
@@ -78,7 +78,7 @@ def test_report_notes_different_versions_of_the_code(answer, tmp_path):
 
 
 def test_report_is_one_page_with_every_number_beside_it(answer, tmp_path):
-    judge(searched(tmp_path, ["mean_steps"]), tmp_path)
+    add_final_trainings(searched(tmp_path, ["mean_steps"]), tmp_path)
     assert answer("--study=a") == (0, "look at   reports/a/report.html\n", "")
     folder = tmp_path / "reports" / "a"
     page = (folder / "report.html").read_text()
@@ -141,7 +141,7 @@ def chart_below(page, heading):
 
 
 def test_history_has_the_best_so_far_and_every_number_is_rounded(answer, tmp_path):
-    judge(searched(tmp_path, ["mean_steps"]), tmp_path)
+    add_final_trainings(searched(tmp_path, ["mean_steps"]), tmp_path)
     page = page_of(answer, tmp_path)
     points, best = chart_below(page, "History")
     assert best["name"] == "best so far"
@@ -155,7 +155,7 @@ def test_history_has_the_best_so_far_and_every_number_is_rounded(answer, tmp_pat
 
 
 def test_videos_are_after_the_charts_and_pruned_trials_look_so(answer, tmp_path):
-    judge(searched(tmp_path, ["mean_steps"]), tmp_path)
+    add_final_trainings(searched(tmp_path, ["mean_steps"]), tmp_path)
     page = page_of(answer, tmp_path)
     assert page.index("<h2>Parallel") < page.index("<h2>Episodes on a test volume") < page.index("<h2>Trials")
     lines = {each["name"]: each["marker"]["symbol"][-1] for each in chart_below(page, "While training")}
@@ -208,7 +208,7 @@ def test_running_trials_are_listed_with_how_far_they_are(answer, tmp_path):
 
 
 def test_report_fits_a_screen_and_a_phone(answer, tmp_path, browser):
-    judge(searched(tmp_path, ["mean_steps"], n_trials=30), tmp_path)
+    add_final_trainings(searched(tmp_path, ["mean_steps"], n_trials=30), tmp_path)
     assert answer("--study=a")[0] == 0
     browser.open((tmp_path / "reports" / "a" / "report.html").as_uri())
     browser.count(".js-plotly-plot .main-svg", at_least=5)
@@ -285,7 +285,7 @@ def test_report_answers_mistakes_in_one_line(answer, tmp_path, words, line):
 
 def test_report_shows_no_file_that_a_strangers_folder_links_to(answer, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    judge(searched(tmp_path, ["mean_steps"]), tmp_path)
+    add_final_trainings(searched(tmp_path, ["mean_steps"]), tmp_path)
     (tmp_path / "secret").write_text("secret")
     for film in tmp_path.glob("trials/seed_*/episode.gif"):
         film.unlink()

@@ -15,9 +15,9 @@ from armscan.stats.paired import paired_difference
 from armscan.sweeps.results import difference as difference_module
 from armscan.sweeps.results.csv_tables import _ending_rows
 from armscan.sweeps.results.difference import Difference
-from armscan.sweeps.results.judgement import Judgement, judge
 from armscan.sweeps.results.progress import final_line
 from armscan.sweeps.results.selection import candidates_of
+from armscan.sweeps.results.study_result import StudyResult, study_result
 from armscan.sweeps.results.study_run import COMPARISONS, best_metrics, result_note
 from armscan.sweeps.scheduling.limits import Limits
 from armscan.sweeps.scheduling.population import searched_values
@@ -35,7 +35,7 @@ from armscan.sweeps.study.study import make_study
 from tests.sweeps.conftest import fail
 from tests.sweeps.study.test_study import settings
 
-FINAL_EVAL = {"top_k": 2, "min_seeds": 2, "mean_seeds": 4, "judge_seeds": 3, "episodes": 9}
+FINAL_EVAL = {"top_k": 2, "min_seeds": 2, "mean_seeds": 4, "test_seeds": 3, "episodes": 9}
 # Mean steps of each configuration on all volumes: the luckiest trial of the search is not the best.
 TRUE = {CONTROL: 6.0, 0: 5.0, 1: 3.0, 2: 9.0}
 LUCK = {0: 1.0, 1: 2.0, 2: 9.0}
@@ -75,7 +75,7 @@ def opened(uri, max_retries=10, **changes):
     limits = Limits(n_trials=10**9, max_retries=max_retries)
     phases = (
         (final.selection, final.missing_of_selection, final.unwanted_of_selection),
-        (final.judgement, final.missing_of_judgement, final.unwanted_of_judgement),
+        (final.test, final.missing_of_test, final.unwanted_of_test),
     )
     return final, [
         TrialScheduler(study, storage, limits, plan, is_current=final.is_current, unwanted=unwanted)
@@ -135,67 +135,67 @@ def test_test_volumes_are_used_for_the_chosen_configuration_and_the_control_alon
     final = run(storage_uri)
     assert final.contenders() == [CONTROL, 0, 1]
     assert final.race().chosen == 1
-    assert {number for number, _ in trained(final.judgement)} == {CONTROL, 1}
-    # The judgement uses no seed of the search or the selection.
+    assert {number for number, _ in trained(final.test)} == {CONTROL, 1}
+    # The result uses no seed of the search or the selection.
     assert {seed for _, seed in trained(final.selection)} <= set(range(1000, 1005))
-    assert {seed for _, seed in trained(final.judgement)} == {2000, 2001, 2002}
-    judgement = judge(final)
-    assert (judgement.chosen, judgement.n_seeds, judgement.others) == (1, 3, ())
-    difference = {each.metric: each for each in judgement.differences}["mean_steps"]
+    assert {seed for _, seed in trained(final.test)} == {2000, 2001, 2002}
+    result = study_result(final)
+    assert (result.chosen, result.n_seeds, result.others) == (1, 3, ())
+    difference = {each.metric: each for each in result.differences}["mean_steps"]
     assert difference.paired.low <= -3.0 <= difference.paired.high < 0
-    assert difference.verdict == "better"
+    assert difference.direction == "better"
     assert difference.probability.value == 1.0
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_workers_that_die_change_nothing_and_no_training_is_run_twice(tmp_path, seed):
     quiet, killed = run(str(tmp_path / "a"), chance=QUIET), run(str(tmp_path / "b"), chance=random.Random(seed))
-    for name in ("selection", "judgement"):
+    for name in ("selection", "test"):
         ours, theirs = (trained(getattr(final, name)) for final in (quiet, killed))
         assert len(theirs) == len(set(theirs))
         assert sorted(ours) == sorted(theirs)
     fewest, most = n_trainings(killed.settings)
-    assert len(trained(quiet.selection)) + len(trained(quiet.judgement)) in range(fewest, most + 1)
+    assert len(trained(quiet.selection)) + len(trained(quiet.test)) in range(fewest, most + 1)
 
 
-def test_control_is_judged_during_the_race_and_the_chosen_configuration_after_it(storage_uri):
-    final, (selection, judgement) = opened(storage_uri)
-    control = [(CONTROL, seed) for seed in final.judge_seeds]
+def test_control_is_tested_during_the_race_and_the_chosen_configuration_after_it(storage_uri):
+    final, (selection, test) = opened(storage_uri)
+    control = [(CONTROL, seed) for seed in final.test_seeds]
     running = selection.claim({})
     assert not final.race().is_over
-    while trial := judgement.claim({}):
-        end(judgement, trial, TRUE)
-    assert trained(final.judgement) == control
+    while trial := test.claim({}):
+        end(test, trial, TRUE)
+    assert trained(final.test) == control
     end(selection, running, TRUE)
     final = run(storage_uri, chance=QUIET)
-    assert trained(final.judgement) == control + [(1, seed) for seed in final.judge_seeds]
-    assert judge(final).chosen == 1
+    assert trained(final.test) == control + [(1, seed) for seed in final.test_seeds]
+    assert study_result(final).chosen == 1
 
 
-def test_study_whose_judgement_was_interrupted_says_how_many_trainings_are_missing(storage_uri):
+def test_study_whose_test_was_interrupted_says_how_many_trainings_are_missing(storage_uri):
     final, schedulers = opened(storage_uri)
     for scheduler, n_claims in zip(schedulers, (100, 5), strict=True):
         for _ in range(n_claims):
             if trial := scheduler.claim({}):
                 end(scheduler, trial, TRUE)
     # Three seeds of the chosen configuration and of the control.
-    assert final.n_unjudged == 1
-    assert judge(final).n_unjudged == 1
+    assert final.n_untested == 1
+    assert study_result(final).n_untested == 1
     run(storage_uri)
-    assert final.n_unjudged == 0
+    assert final.n_untested == 0
 
 
 def test_control_whose_trainings_failed_leaves_no_comparison_and_the_result_says_so(storage_uri):
-    final, (selection, judgement) = opened(storage_uri)
+    final, (selection, test) = opened(storage_uri)
     while trial := selection.claim({}):
         end(selection, trial, TRUE)
-    while trial := judgement.claim({}):
+    while trial := test.claim({}):
         if trial.user_attrs[FINALIST] == CONTROL:
-            judgement.study.tell(trial, state=TrialState.FAIL)
+            test.study.tell(trial, state=TrialState.FAIL)
         else:
-            end(judgement, trial, TRUE)
+            end(test, trial, TRUE)
     expected = "Trial 1 was chosen, but it cannot be compared with the control: 0 of 3 seeds were trained"
-    assert judge(final).statement.startswith(expected)
+    assert study_result(final).statement.startswith(expected)
 
 
 def test_control_that_no_candidate_completed_the_race_beside_has_beaten_none(storage_uri):
@@ -206,20 +206,20 @@ def test_control_that_no_candidate_completed_the_race_beside_has_beaten_none(sto
         else:
             selection.study.tell(trial, state=TrialState.FAIL)
     expected = "The control was chosen, because trainings of all other candidates have failed."
-    assert judge(final).statement == expected
+    assert study_result(final).statement == expected
 
 
-def test_control_that_was_judged_before_the_chosen_configuration_is_not_its_result(storage_uri):
-    final, (selection, judgement) = opened(storage_uri)
-    for scheduler in (judgement, selection):
+def test_control_that_was_tested_before_the_chosen_configuration_is_not_its_result(storage_uri):
+    final, (selection, test) = opened(storage_uri)
+    for scheduler in (test, selection):
         while trial := scheduler.claim({}):
             end(scheduler, trial, TRUE)
-        # The chosen configuration is judged later.
-    judged = judge(final)
-    assert (judged.chosen, [each.number for each in judged.results]) == (1, [CONTROL])
-    assert judged.of_chosen is None
-    assert result_note(judged) == ""
-    assert not [name for name in best_metrics(final.search, judged) if name.startswith("test_volumes/")]
+        # The chosen configuration is result later.
+    result = study_result(final)
+    assert (result.chosen, [each.number for each in result.results]) == (1, [CONTROL])
+    assert result.of_chosen is None
+    assert result_note(result) == ""
+    assert not [name for name in best_metrics(final.search, result) if name.startswith("test_volumes/")]
 
 
 def test_plan_counts_the_final_trainings_that_are_left(storage_uri):
@@ -233,10 +233,10 @@ def test_plan_counts_the_final_trainings_that_are_left(storage_uri):
     # Further trials may change the candidates, or not.
     assert final_trainings_left(settings, final, n_left=1) == (0, most)
     more = settings.model_copy(
-        update={"final_eval": settings.final_eval.model_copy(update={"judge_seeds": len(final.judge_seeds) + 2})}
+        update={"final_eval": settings.final_eval.model_copy(update={"test_seeds": len(final.test_seeds) + 2})}
     )
     assert final_trainings_left(more, final, n_left=0) == (4, 4)
-    # A new candidate takes the place of one whose scores then do not count; the control has been judged.
+    # A new candidate takes the place of one whose scores then do not count; the control has been tested.
     better = final.search.ask()
     better.suggest_float("agent.lr", 1e-4, 1e-2)
     final.search.tell(better, 0.5)
@@ -256,11 +256,11 @@ def test_plan_knows_that_a_round_of_the_race_occupies_few_workers(storage_uri):
 
 def test_control_that_is_the_best_is_the_result(storage_uri):
     final = run(storage_uri, true=TRUE | {CONTROL: 1.0})
-    judgement = judge(final)
-    assert judgement.chosen == CONTROL
-    assert "No setting beat the control" in judgement.statement
-    assert {number for number, _ in trained(final.judgement)} == {CONTROL}
-    assert judgement.differences == ()
+    result = study_result(final)
+    assert result.chosen == CONTROL
+    assert "No setting beat the control" in result.statement
+    assert {number for number, _ in trained(final.test)} == {CONTROL}
+    assert result.differences == ()
 
 
 @pytest.mark.parametrize(("top_k", "contenders"), [(0, []), (1, [CONTROL, 1]), (2, [CONTROL, 1, 2])])
@@ -308,13 +308,13 @@ def test_study_that_goes_on_says_for_whom_else_the_test_volumes_were_used(storag
     trial.suggest_float("agent.lr", 1e-4, 1e-2)
     search.tell(trial, 0.5)
     final = run(storage_uri, true=TRUE | {3: 0.5})
-    assert (judge(final).chosen, judge(final).others) == (3, (1,))
-    assert "used before for trial 1" in judge(final).notes[0]
+    assert (study_result(final).chosen, study_result(final).others) == (3, (1,))
+    assert "used before for trial 1" in study_result(final).notes[0]
 
 
 def test_run_of_a_study_that_goes_on_until_the_control_wins_keeps_no_difference(storage_uri):
     first = run(storage_uri)
-    before = best_metrics(first.search, judge(first))
+    before = best_metrics(first.search, study_result(first))
     _, asked, search = searched(storage_uri)
     for number in range(asked.final_eval.top_k):
         trial = search.ask()
@@ -322,9 +322,9 @@ def test_run_of_a_study_that_goes_on_until_the_control_wins_keeps_no_difference(
         trial.set_user_attr(METRICS, {"mean_steps": 0.5, "success_rate": 0.5})
         search.tell(trial, 0.5 + 0.01 * number)
     worse = dict.fromkeys(range(3, 3 + asked.final_eval.top_k), 9.0)
-    judged = judge(run(storage_uri, true=TRUE | worse))
-    assert (judged.chosen, judged.others) == (CONTROL, (1,))
-    after = best_metrics(search, judged)
+    result = study_result(run(storage_uri, true=TRUE | worse))
+    assert (result.chosen, result.others) == (CONTROL, (1,))
+    after = best_metrics(search, result)
     invalid = [name for name in before if name.startswith((*COMPARISONS, "selection/"))]
     assert {"difference/mean_steps_low", "selection/mean_steps"} <= {*invalid}
     assert all(math.isnan(after[name]) for name in invalid)
@@ -332,10 +332,10 @@ def test_run_of_a_study_that_goes_on_until_the_control_wins_keeps_no_difference(
 
 def test_run_of_the_study_has_the_result(storage_uri):
     final = run(storage_uri)
-    judged = judge(final)
-    metrics = best_metrics(final.search, judged)
+    result = study_result(final)
+    metrics = best_metrics(final.search, result)
     assert best_metrics(final.search, None) == {"selection/mean_steps": 1.0, "selection/success_rate": 0.5}
-    assert metrics["selection/mean_steps"] == final.search.trials[judged.chosen].user_attrs[METRICS]["mean_steps"] > 1
+    assert metrics["selection/mean_steps"] == final.search.trials[result.chosen].user_attrs[METRICS]["mean_steps"] > 1
     assert metrics["difference/mean_steps_low"] < metrics["difference/mean_steps"] < 0
     assert metrics["probability_of_improvement/mean_steps"] == 1.0
     assert metrics["test_volumes/mean_steps"] < 4.0
@@ -343,20 +343,20 @@ def test_run_of_the_study_has_the_result(storage_uri):
 
 def test_note_on_a_study_says_which_settings_how_sure_and_what_helps(storage_uri):
     final = run(storage_uri)
-    said, chosen, control, *rest = result_note(judge(final)).split("\n\n")
+    said, chosen, control, *rest = result_note(study_result(final)).split("\n\n")
     assert said == "**Trial 1 is better than the control (steps, mean).**"
     assert chosen.startswith("trial 1: `agent.lr=0.0")
     assert control.startswith("control: the study's configuration without")
     assert "| with 95 % intervals | trial 1 | control |" in rest[1]
     assert rest[2] == "Trial 1 and the control, both with the same 3 new seeds:"
-    difference = judge(final).differences[0].row()
+    difference = study_result(final).differences[0].row()
     assert rest[3].splitlines()[2] == f"| {' | '.join(difference.values())} |"
     assert rest[-1].startswith("Note: 3 test subjects, fewer than 8")
 
 
-def test_one_judge_seed_gives_a_difference_without_interval_and_the_result_says_so(storage_uri):
-    final = run(storage_uri, judge_seeds=1, episodes=3)
-    said, *_, table, _, _ = result_note(judge(final)).split("\n\n")
+def test_one_test_seed_gives_a_difference_without_interval_and_the_result_says_so(storage_uri):
+    final = run(storage_uri, test_seeds=1, episodes=3)
+    said, *_, table, _, _ = result_note(study_result(final)).split("\n\n")
     assert said == "**Trial 1 was chosen; one seed does not show whether it is better than the control.**"
     first = table.splitlines()[2].split("|")
     assert float(first[2]) < 0.0
@@ -364,7 +364,7 @@ def test_one_judge_seed_gives_a_difference_without_interval_and_the_result_says_
 
 
 def test_note_on_a_study_that_has_no_result_is_empty(storage_uri):
-    assert result_note(None) == result_note(judge(opened(storage_uri)[0])) == ""
+    assert result_note(None) == result_note(study_result(opened(storage_uri)[0])) == ""
 
 
 def test_final_evaluation_is_read_from_the_storage_and_that_of_an_earlier_version_is_none(storage_uri):
@@ -374,7 +374,7 @@ def test_final_evaluation_is_read_from_the_storage_and_that_of_an_earlier_versio
     assert stored_final_eval(storage, search) is None
     final = open_final_eval(storage, asked, search, None)
     assert stored_final_eval(open_storage(storage_uri), search).settings == final.settings
-    before = {"top_k": 2, "min_seeds": 3, "max_seeds": 8, "judge_seeds": 5}
+    before = {"top_k": 2, "min_seeds": 3, "max_seeds": 8, "test_seeds": 5}
     final.selection.set_user_attr("final_eval", {"settings": before, "search_seed": 0, "control": None})
     assert stored_final_eval(storage, search) is None
 
@@ -402,9 +402,10 @@ def test_latest_trial_of_each_member_is_trained_with_its_whole_schedule(storage_
     assert trial.suggest_float("agent.lr", 1e-4, 1e-2) == 0.001
 
 
-def test_settings_of_an_earlier_version_are_read():
-    before = {"top_k": 2, "min_seeds": 2, "mean_seeds": 4, "n_seeds": 7}
-    assert FinalEvalSettings.read("a", before).model_dump() == FINAL_EVAL | {"judge_seeds": 7, "episodes": None}
+@pytest.mark.parametrize("name", ["n_seeds", "judge_seeds"])
+def test_settings_of_an_earlier_version_are_read(name):
+    before = {"top_k": 2, "min_seeds": 2, "mean_seeds": 4, name: 7}
+    assert FinalEvalSettings.read("a", before).model_dump() == FINAL_EVAL | {"test_seeds": 7, "episodes": None}
 
 
 def test_nothing_is_left_of_a_final_evaluation_whose_trainings_all_failed(storage_uri):
@@ -415,7 +416,7 @@ def test_nothing_is_left_of_a_final_evaluation_whose_trainings_all_failed(storag
     assert final.race().is_over
     assert final.race().chosen is None
     assert final_trainings_left(searched(storage_uri)[1], final, n_left=0) == (0, 0)
-    assert final.missing_of_judgement() == []
+    assert final.missing_of_test() == []
 
 
 def test_trainings_that_failed_before_a_restart_are_run_again(storage_uri):
@@ -428,13 +429,13 @@ def test_trainings_that_failed_before_a_restart_are_run_again(storage_uri):
     assert final.race().chosen == 1
 
 
-@pytest.mark.parametrize("phase", ["selection", "judgement"])
+@pytest.mark.parametrize("phase", ["selection", "test"])
 def test_final_evaluation_that_failed_is_run_again_once_it_is_started_again(storage_uri, phase):
     final, schedulers = opened(storage_uri)
-    if phase == "judgement":
+    if phase == "test":
         while trial := schedulers[0].claim({}):
             end(schedulers[0], trial, TRUE)
-    scheduler = dict(zip(("selection", "judgement"), schedulers, strict=True))[phase]
+    scheduler = dict(zip(("selection", "test"), schedulers, strict=True))[phase]
     assert final.blocked() == []
     while trial := scheduler.claim({}):
         # Too few failures to end the study.
@@ -446,11 +447,11 @@ def test_final_evaluation_that_failed_is_run_again_once_it_is_started_again(stor
     assert scheduler.reset_failures(is_blocked=True) == n_failed
     assert scheduler.failures(scheduler.state()) == []
     run(storage_uri)
-    assert judge(final).n_seeds == FINAL_EVAL["judge_seeds"]
+    assert study_result(final).n_seeds == FINAL_EVAL["test_seeds"]
     assert final.blocked() == []
 
 
-@pytest.mark.parametrize("phase", [0, 1], ids=["selection", "judgement"])
+@pytest.mark.parametrize("phase", [0, 1], ids=["selection", "test"])
 def test_training_whose_worker_and_that_of_its_retry_died_is_run_again_after_a_restart(storage_uri, phase):
     final, schedulers = opened(storage_uri, max_retries=1)
     if phase == 1:
@@ -463,15 +464,15 @@ def test_training_whose_worker_and_that_of_its_retry_died_is_run_again_after_a_r
     assert final.blocked() == [scheduler.study.study_name]
     assert scheduler.reset_failures(is_blocked=True)
     final = run(storage_uri)
-    assert (judge(final).n_seeds, final.n_unjudged) == (FINAL_EVAL["judge_seeds"], 0)
+    assert (study_result(final).n_seeds, final.n_untested) == (FINAL_EVAL["test_seeds"], 0)
 
 
 def test_trainings_that_wait_are_dropped_once_another_configuration_is_chosen(storage_uri):
-    final, (selection, judgement) = opened(storage_uri)
+    final, (selection, test) = opened(storage_uri)
     while trial := selection.claim({"worker": "a"}):
         end(selection, trial, TRUE)
-    # All trainings of the judgement wait, and the study goes on.
-    judgement.requeue(judgement.claim({"worker": "a"}), {"worker": "a"})
+    # All trainings of the test wait, and the study goes on.
+    test.requeue(test.claim({"worker": "a"}), {"worker": "a"})
     trial = final.search.ask()
     trial.suggest_float("agent.lr", 1e-4, 1e-2)
     trial.set_user_attr(METRICS, {"mean_steps": 0.5, "success_rate": 0.5})
@@ -479,30 +480,30 @@ def test_trainings_that_wait_are_dropped_once_another_configuration_is_chosen(st
     # Trial 1 is a candidate no more, and it has trainings that wait.
     selection.study.enqueue_trial({}, user_attrs={FINALIST: 1, FINAL_SEED: 1005})
     final = run(storage_uri, true=TRUE | {3: 0.5})
-    assert (judge(final).chosen, judge(final).others) == (3, ())
-    assert {number for number, _ in trained(final.judgement)} == {CONTROL, 3}
+    assert (study_result(final).chosen, study_result(final).others) == (3, ())
+    assert {number for number, _ in trained(final.test)} == {CONTROL, 3}
     assert (1, 1005) not in trained(final.selection)
 
 
 def test_trainings_of_an_earlier_configuration_of_the_study_are_run_again(storage_uri):
     first = run(storage_uri)
-    assert judge(first).differences[0].paired.value < -2.5
-    n_before = len(trained(first.judgement))
+    assert study_result(first).differences[0].paired.value < -2.5
+    n_before = len(trained(first.test))
     again = run(storage_uri, true=dict.fromkeys(TRUE, 5.0) | {1: 4.9}, fixed={"env": {"max_steps": 40}})
-    assert judge(again).chosen == CONTROL or judge(again).differences[0].paired.value > -1.0
-    assert len(trained(again.judgement)) >= n_before + FINAL_EVAL["judge_seeds"]
-    assert "the test volumes were used before, with another configuration of the study" in judge(again).notes
+    assert study_result(again).chosen == CONTROL or study_result(again).differences[0].paired.value > -1.0
+    assert len(trained(again.test)) >= n_before + FINAL_EVAL["test_seeds"]
+    assert "the test volumes were used before, with another configuration of the study" in study_result(again).notes
 
 
 @pytest.mark.parametrize(("constraint", "is_kept"), [("mean_steps >= 2", False), ("mean_steps >= 0", True)])
-def test_control_that_violates_a_constraint_is_judged_but_not_chosen(storage_uri, constraint, is_kept):
+def test_control_that_violates_a_constraint_is_tested_but_not_chosen(storage_uri, constraint, is_kept):
     final = run(storage_uri, true=TRUE | {CONTROL: 1.0}, constraints=[constraint])
     assert final.violated().get(CONTROL, []) == ([] if is_kept else [constraint])
-    judgement = judge(final)
-    assert judgement.chosen == (CONTROL if is_kept else 1)
+    result = study_result(final)
+    assert result.chosen == (CONTROL if is_kept else 1)
     told = f"the control violates {constraint} in the race, so it could not be chosen"
-    assert (told in judgement.notes) is not is_kept
-    assert {number for number, _ in trained(final.judgement)} == {CONTROL, judgement.chosen}
+    assert (told in result.notes) is not is_kept
+    assert {number for number, _ in trained(final.test)} == {CONTROL, result.chosen}
 
 
 def test_control_that_violates_a_constraint_leaves_the_race_after_its_first_round(storage_uri):
@@ -517,15 +518,15 @@ def test_candidate_that_violates_a_constraint_in_the_race_is_not_chosen(storage_
     final = run(storage_uri, true={CONTROL: 2.5, 0: 6.0, 1: 1.0, 2: 9.0}, constraints=["mean_steps >= 2"])
     assert final.violated() == {1: ["mean_steps >= 2"]}
     assert final.race().standings[1].is_withdrawn
-    judgement = judge(final)
-    assert judgement.chosen == CONTROL
-    assert "trial 1 violates mean_steps >= 2 in the race, so it could not be chosen" in judgement.notes
+    result = study_result(final)
+    assert result.chosen == CONTROL
+    assert "trial 1 violates mean_steps >= 2 in the race, so it could not be chosen" in result.notes
 
 
 def test_configurations_race_on_if_all_violate_a_constraint(storage_uri):
     final = run(storage_uri, true={CONTROL: 5.0, 0: 6.0, 1: 4.0, 2: 9.0}, constraints=["mean_steps <= 1"])
-    assert judge(final).chosen == 1
-    assert "trial 1 violates mean_steps <= 1 in the race" in judge(final).notes
+    assert study_result(final).chosen == 1
+    assert "trial 1 violates mean_steps <= 1 in the race" in study_result(final).notes
 
 
 def test_one_seed_that_violates_a_constraint_does_not_decide(storage_uri):
@@ -576,40 +577,40 @@ def test_difference_counts_volumes_of_one_arm_once(storage_uri, monkeypatch):
         return paired_difference(*arguments)
 
     monkeypatch.setattr(difference_module, "paired_difference", recorded)
-    judge(run(storage_uri))
+    study_result(run(storage_uri))
     assert given[0] == ["a", "a", "b"]
 
 
-def test_training_that_waits_for_its_retry_is_still_to_be_judged(storage_uri):
-    final = run(storage_uri, judge_seeds=3)
-    _, (_, judgement) = opened(storage_uri, judge_seeds=4)
-    final, _ = opened(storage_uri, judge_seeds=4)
-    n_unjudged = final.n_unjudged
-    assert n_unjudged > 0
-    judgement.claim({"worker": "a"})
-    judgement.reclaim(lambda _: True)
-    assert final.n_unjudged == n_unjudged
+def test_training_that_waits_for_its_retry_is_still_to_be_tested(storage_uri):
+    final = run(storage_uri, test_seeds=3)
+    _, (_, test) = opened(storage_uri, test_seeds=4)
+    final, _ = opened(storage_uri, test_seeds=4)
+    n_untested = final.n_untested
+    assert n_untested > 0
+    test.claim({"worker": "a"})
+    test.reclaim(lambda _: True)
+    assert final.n_untested == n_untested
 
 
 def test_settings_that_a_continued_study_has_are_stored(storage_uri):
     opened(storage_uri)
-    opened(storage_uri, judge_seeds=5)
+    opened(storage_uri, test_seeds=5)
     storage, _, search = searched(storage_uri)
-    assert len(stored_final_eval(storage, search).judge_seeds) == 5
+    assert len(stored_final_eval(storage, search).test_seeds) == 5
 
 
 def test_trainings_of_an_earlier_configuration_neither_run_nor_count_as_failed(storage_uri):
-    _, (_, judgement) = opened(storage_uri)
-    fail(judgement, judgement.claim({"worker": "a"}), "the disk was full")
-    judgement.requeue(trial := judgement.claim({"worker": "a"}), {"worker": "a"})
-    assert judgement.claim({"worker": "b"}).number == trial.number
-    judgement.requeue(trial, {"worker": "b"})
+    _, (_, test) = opened(storage_uri)
+    fail(test, test.claim({"worker": "a"}), "the disk was full")
+    test.requeue(trial := test.claim({"worker": "a"}), {"worker": "a"})
+    assert test.claim({"worker": "b"}).number == trial.number
+    test.requeue(trial, {"worker": "b"})
     final, (_, again) = opened(storage_uri, fixed={"env": {"max_steps": 40}})
     assert again.failures(again.state()) == []
     assert again.claim({"worker": "c"}).number > trial.number
     # The command that has the earlier configuration trains no more.
-    assert judgement.claim({"worker": "a"}) is None
-    assert final.judgement.trials[trial.number].state == TrialState.FAIL
+    assert test.claim({"worker": "a"}) is None
+    assert final.test.trials[trial.number].state == TrialState.FAIL
 
 
 def test_training_of_the_final_evaluation_cannot_be_stopped_alone(storage_uri):
@@ -622,11 +623,11 @@ def test_training_of_the_final_evaluation_cannot_be_stopped_alone(storage_uri):
 def test_difference_that_is_the_same_everywhere_has_no_interval_to_speak_of():
     same = Estimate(1.0, 1.0, 1.0)
     difference = Difference("success_rate", True, same, Estimate(1.0, 1.0, 1.0))
-    judgement = Judgement(
+    result = StudyResult(
         chosen=3, results=(), differences=(difference,), n_seeds=2, n_planned=2, others=(), settings={}
     )
     assert (
-        judgement.statement
+        result.statement
         == "Trial 3 was chosen; its difference from the control is +100.0 points for every seed and volume "
         "(success, by reward)."
     )
@@ -644,21 +645,21 @@ def test_difference_that_is_not_0_does_not_look_like_it():
 def test_volume_without_a_value_is_left_out_of_the_comparison_and_the_result_says_so(storage_uri, n_unknown):
     def steps_with_unknown(number, seed, true):
         steps = steps_of(number, seed, true)
-        # One volume of a judged training, or another one of each.
+        # One volume of a tested training, or another one of each.
         unknown = {1: [(1, 2001, 1)], 3: [(1, 2000, 0), (1, 2001, 1), (CONTROL, 2002, 2)]}[n_unknown]
         return np.where([(number, seed, volume) in unknown for volume in range(3)], np.nan, steps)
 
     final = run(storage_uri, chance=QUIET, measured=steps_with_unknown)
-    judgement = judge(final)
-    first = judgement.differences[0]
+    result = study_result(final)
+    first = result.differences[0]
     assert (first.metric, first.n_left_out) == ("mean_steps", n_unknown)
-    assert f"steps, mean is compared without {n_unknown} test volume" in " ".join(judgement.notes)
+    assert f"steps, mean is compared without {n_unknown} test volume" in " ".join(result.notes)
     if n_unknown == 1:
-        assert judgement.statement == "Trial 1 is better than the control (steps, mean)."
+        assert result.statement == "Trial 1 is better than the control (steps, mean)."
     else:
-        assert judgement.statement == (
+        assert result.statement == (
             "Trial 1 was chosen, but it cannot be compared with the control (steps, mean): no test volume has a value "
             "in every training."
         )
         assert set(first.row().values()) == {"steps, mean (lower is better)", ""}
-    assert result_note(judgement)
+    assert result_note(result)

@@ -41,7 +41,7 @@ def settings(**changes):
         "workers": 1,
         "seed": 0,
         "seeds": (0,),
-        "final_eval": FinalEvalSettings(top_k=0, min_seeds=1, mean_seeds=1, judge_seeds=1, episodes=3),
+        "final_eval": FinalEvalSettings(top_k=0, min_seeds=1, mean_seeds=1, test_seeds=1, episodes=3),
         "allow_config_changes": False,
     }
     return StudySettings(**values | changes)
@@ -210,7 +210,7 @@ def test_study_of_an_earlier_version_goes_on_with_the_names_of_this_one(storage_
     ratio = trial.suggest_float("agent.updates_per_env_step", **lr)
     study.tell(trial, 1.0)
     fixed = {"env": {"_target_": "armscan.envs.EnvFactory"}, "agent": {"learning_starts": 2000}}
-    final_eval = FinalEvalSettings(top_k=1, min_seeds=1, mean_seeds=1, judge_seeds=1, episodes=3)
+    final_eval = FinalEvalSettings(top_k=1, min_seeds=1, mean_seeds=1, test_seeds=1, episodes=3)
     now = settings(space=Space.read({"agent.utd_ratio": lr}), final_eval=final_eval)
     search = make_study(storage, now, fixed)
     control, best = open_final_eval(storage, now, search, None).missing_of_selection()
@@ -223,7 +223,7 @@ def test_changed_configuration_drops_finished_seeds_of_an_interrupted_trial(stor
     study.tell(study.ask(), 1.0)
     trial = study.ask()
     trial.set_user_attr(SEEDS, {"0": {"mean_steps": 1.0}})
-    more = settings(final_eval=FinalEvalSettings(top_k=0, min_seeds=1, mean_seeds=1, judge_seeds=1, episodes=7))
+    more = settings(final_eval=FinalEvalSettings(top_k=0, min_seeds=1, mean_seeds=1, test_seeds=1, episodes=7))
     # No trial of the search depends on the episodes of final trainings.
     assert is_reconfigured(study, more, FIXED)
     study = make_study(storage, more, FIXED)

@@ -88,7 +88,7 @@ def test_values_of_earlier_versions_are_not_taken_because_they_were_best_validat
 
 def test_trials_with_fewer_episodes_in_final_trainings_are_taken_with_their_values(study_in):
     study_in("before", {"agent.lr": LR}, FIXED, rows=[({"agent.lr": 1e-3}, 3.0)])
-    final_eval = FinalEvalSettings(top_k=0, min_seeds=1, mean_seeds=1, judge_seeds=1, episodes=7)
+    final_eval = FinalEvalSettings(top_k=0, min_seeds=1, mean_seeds=1, test_seeds=1, episodes=7)
     (message,) = begin(study_in("after", {"agent.lr": LR}, FIXED, warm_start=["before"], final_eval=final_eval))
     assert message.endswith("1 taken with their values")
 
@@ -222,7 +222,7 @@ def test_taken_trial_with_the_values_of_the_control_is_no_candidate_beside_it(st
     control, misfit = values_of(Space.read(space), words)
     assert (control, misfit) == ({"agent.lr": 2e-3, "stack": 1}, None)
     study_in("before", space, rows=[(control, 1.0), (control | {"stack": 4}, 2.0)])
-    final_eval = FinalEvalSettings(top_k=2, min_seeds=1, mean_seeds=1, judge_seeds=1, episodes=3)
+    final_eval = FinalEvalSettings(top_k=2, min_seeds=1, mean_seeds=1, test_seeds=1, episodes=3)
     asked, storage, study = made = study_in("now", space, warm_start=["before"], final_eval=final_eval)
     begin(made)
     assert open_final_eval(storage, asked, study, None).contenders() == [CONTROL, 0, 1]

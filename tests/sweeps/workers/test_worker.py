@@ -448,22 +448,22 @@ def test_stopped_study_requeues_its_trial_and_goes_on_when_it_is_started_again(w
 def phases_with_training_of_another(monkeypatch, make_phase):
     """Return a function that makes phases whose selection waits for another worker's training, and what ends that."""
 
-    def make(judge):
+    def make(run_test):
         chosen = 0
 
         def plan():
-            begun = [trial.user_attrs[FINALIST] for trial in judgement.scheduler.study.trials]
+            begun = [trial.user_attrs[FINALIST] for trial in test.scheduler.study.trials]
             known = [CONTROL] if selection.scheduler.state().running else [CONTROL, chosen]
             return [PlannedTrial({}, {FINALIST: number, FINAL_SEED: 7}) for number in known if number not in begun]
 
         search = make_phase("a", n_trials=1)
         selection = make_phase("a", name="a-selection", plan=list)
-        judgement = make_phase("a", judge, name="a-judged", plan=plan)
+        test = make_phase("a", run_test, name="a-judged", plan=plan)
         lease = {"worker": "another", **asdict(ProcessInfo.current())}
         attributes = {FINALIST: chosen, FINAL_SEED: 3, LEASE: lease, METRICS: {}}
         selection.scheduler.study.enqueue_trial({}, user_attrs=attributes)
         number = selection.scheduler.study.ask().number
-        opened = SimpleNamespace(phases=(search, selection, judgement), finals=(selection, judgement))
+        opened = SimpleNamespace(phases=(search, selection, test), finals=(selection, test))
         monkeypatch.setattr(worker, "read_settings", lambda words: ())
         monkeypatch.setattr(worker, "open_for_work", lambda *_, **options: opened)
         return opened, lambda: selection.scheduler.study.tell(number, 1.0)
@@ -471,24 +471,24 @@ def phases_with_training_of_another(monkeypatch, make_phase):
     return make
 
 
-def test_worker_judges_the_control_while_another_has_the_last_training_of_the_selection(
+def test_worker_tests_the_control_while_another_has_the_last_training_of_the_selection(
     phases_with_training_of_another,
 ):
     seen = []
 
-    def judge(attempt):
+    def run_test(attempt):
         seen.append((attempt.trial.user_attrs[FINALIST], len(opened.finals[0].scheduler.state().running)))
         if len(seen) == 1:
             end_training()
         return {"mean_steps": 1.0}
 
-    opened, end_training = phases_with_training_of_another(judge)
+    opened, end_training = phases_with_training_of_another(run_test)
     worker.work(["data.n_training=1"], make_heartbeat)
     assert seen == [(CONTROL, 1), (0, 0)]
     assert [len(phase.scheduler.state().finished) for phase in opened.phases] == [1, 1, 2]
 
 
-def test_worker_judges_nothing_once_the_study_is_stopped(monkeypatch, phases_with_training_of_another):
+def test_worker_tests_nothing_once_the_study_is_stopped(monkeypatch, phases_with_training_of_another):
     opened, end_training = phases_with_training_of_another(lambda attempt: {"mean_steps": 1.0})
     opened.finals[0].scheduler.study.set_user_attr(STOP, "by somebody")
     # Called where a worker waits.

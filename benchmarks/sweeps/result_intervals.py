@@ -1,13 +1,13 @@
 """Simulate how often the interval of a study's result contains the true difference, compared with other intervals.
 
-    python -m benchmarks.sweeps.judgement [--studies 2000]
+    python -m benchmarks.sweeps.result_intervals [--studies 2000]
 
 A simulated study has four candidates and the control. The score of a training on a volume is the sum of its
 configuration's true value, an effect of the training, an effect of the configuration on the volume, and a residual, all
 normal. `armscan.sweeps.scheduling.race` selects the configuration. The table counts the studies that do not choose the
 control: the share whose 95 % interval of chosen minus control contains the true difference.
 
-- `paired`: as armscan judges, with new seeds and `armscan.stats.paired`;
+- `paired`: as armscan tests, with new seeds and `armscan.stats.paired`;
 - `bootstrap`: new seeds, and a percentile bootstrap over seeds;
 - `improvement`: the interval of the probability of improvement, instead of the difference.
 """
@@ -51,7 +51,7 @@ def simulate(n_studies: int, n_seeds: int, n_volumes: int, effect: float) -> Cov
 
     Args:
         n_studies: Number of studies.
-        n_seeds: Seeds of the judgement.
+        n_seeds: Seeds of the test.
         n_volumes: Test volumes.
         effect: Standard deviation of the true values of the candidates, around that of the control.
     """
@@ -68,8 +68,8 @@ def simulate(n_studies: int, n_seeds: int, n_volumes: int, effect: float) -> Cov
         rest = REST * rng.standard_normal((*trainings.shape, n))
         return true[..., None, None] + trainings[..., None] + of_volumes + rest
 
-    selecting, judging = trained(MAX_SEEDS), trained(n_seeds)
-    scores, own = played(selecting, N_VALIDATION).mean(axis=-1), played(judging, n_volumes)
+    selecting, testing = trained(MAX_SEEDS), trained(n_seeds)
+    scores, own = played(selecting, N_VALIDATION).mean(axis=-1), played(testing, n_volumes)
     held, n_trainings = [], 0
     for study, table in enumerate(scores):
         by_seed = {number: dict(enumerate(row)) for number, row in enumerate(table)}

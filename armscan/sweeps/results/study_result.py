@@ -16,7 +16,7 @@ from armscan.sweeps.scheduling.state import CONTROL
 from armscan.sweeps.space.parameter import overrides_of
 from armscan.sweeps.storage.attribute_names import OF_CONFIG
 from armscan.sweeps.study.candidates import name_of, settings_of, training_of
-from armscan.sweeps.study.final_eval import FinalEvaluation, to_judge
+from armscan.sweeps.study.final_eval import FinalEvaluation, to_test
 from armscan.training.baselines import RANDOM
 from armscan.training.headline import headline
 from armscan.training.metric_display import title_of
@@ -24,8 +24,8 @@ from armscan.utils.text import counted
 
 
 @dataclass(frozen=True)
-class Judgement:
-    """Judgement of the chosen configuration on the test volumes.
+class StudyResult:
+    """Result of a study: the chosen configuration on the test volumes, beside the control.
 
     Args:
         chosen: Number of the chosen trial, or `CONTROL`.
@@ -35,10 +35,10 @@ class Judgement:
         n_planned: Number of seeds planned for both.
         others: Other trials evaluated on the test volumes, because the study continued after its end.
         settings: Overrides of the chosen one and the control, by their names; an empty string without any.
-        n_unjudged: Number of trainings that have not ended. Default: 0.
+        n_untested: Number of trainings that have not ended. Default: 0.
         have_others_failed: Whether a training of every other candidate failed in the race. Default: False.
         violated: Constraints of the study that configurations violated in the race. Default: none.
-        is_repeated: Whether trainings with an earlier configuration of the study were judged before. Default: False.
+        is_repeated: Whether trainings with an earlier configuration of the study ran there before. Default: False.
         changes: Notes on changes of the study's configuration and of armscan's code. Default: none.
     """
 
@@ -49,7 +49,7 @@ class Judgement:
     n_planned: int
     others: tuple[int, ...]
     settings: Mapping[str, str]
-    n_unjudged: int = 0
+    n_untested: int = 0
     have_others_failed: bool = False
     violated: Mapping[int, Sequence[str]] = field(default_factory=dict)
     is_repeated: bool = False
@@ -57,7 +57,7 @@ class Judgement:
 
     @property
     def notes(self) -> list[str]:
-        """Notes on the judgement."""
+        """Notes on the result."""
         notes = [*self.changes]
         if self.n_seeds < self.n_planned:
             notes.append(f"only {self.n_seeds} of {self.n_planned} seeds have been trained to their end")
@@ -74,9 +74,7 @@ class Judgement:
         if self.is_repeated:
             notes.append("the test volumes were used before, with another configuration of the study")
         if names := ", ".join(map(name_of, self.others)):
-            notes.append(
-                f"the test volumes were used before for {names}: the study went on after its judgement had begun"
-            )
+            notes.append(f"the test volumes were used before for {names}: the study went on after they had been used")
         return [*notes, *(volume_notes(self.results[0].figures) if self.results else ())]
 
     @property
@@ -91,8 +89,8 @@ class Judgement:
         return next((each for each in self.results if each.number == self.chosen), None)
 
     @property
-    def result(self) -> str:
-        """The result: the statement, and the chosen configuration beside random planes."""
+    def summary(self) -> str:
+        """The result in a few sentences: the statement, and the chosen configuration beside random planes."""
         ours = {name_of(each.number): each for each in self.results if each.number == self.chosen}
         randoms = {name: each.baselines[RANDOM] for name, each in ours.items() if RANDOM in each.baselines}
         return f"{self.statement} {headline({name: each.figures for name, each in ours.items()}, randoms)}".strip()
@@ -109,8 +107,8 @@ class Judgement:
                 "selection on the validation volumes."
             )
         name = name_of(self.chosen).capitalize()
-        if not self.differences and self.n_unjudged:
-            return f"{name} was chosen; it has not been judged beside the control yet."
+        if not self.differences and self.n_untested:
+            return f"{name} was chosen; it has not been compared with the control yet."
         if not self.differences:
             reason = f"{self.n_seeds} of {self.n_planned} seeds were trained to their end with both"
             if self.n_seeds:
@@ -129,49 +127,49 @@ class Judgement:
                 f"{name} was chosen; its difference from the control is {first.value_text} for every seed and "
                 f"volume ({title_of(first.metric)})."
             )
-        if first.verdict:
-            return f"{name} is {first.verdict} than the control ({title_of(first.metric)})."
+        if first.direction:
+            return f"{name} is {first.direction} than the control ({title_of(first.metric)})."
         return (
             f"{name} was chosen, but the test volumes do not show that it is better than the control: the interval of "
             f"the difference contains 0 ({title_of(first.metric)})."
         )
 
 
-def judge(final: FinalEvaluation) -> Judgement | None:
-    """Return the judgement on the test volumes; None before a configuration is chosen."""
+def study_result(final: FinalEvaluation) -> StudyResult | None:
+    """Return the result of a study; None before a configuration is chosen."""
     race = final.race()
     if (chosen := race.chosen) is None:
         return None
-    judged = final.judged()
-    both = to_judge(race)
-    now = [judged[number, seed] for number in both for seed in final.judge_seeds if (number, seed) in judged]
-    seeds = [seed for seed in final.judge_seeds if all((number, seed) in judged for number in both)]
-    pairs = [[judged[number, seed] for seed in seeds] for number in both]
+    tested = final.tested()
+    both = to_test(race)
+    now = [tested[number, seed] for number in both for seed in final.test_seeds if (number, seed) in tested]
+    seeds = [seed for seed in final.test_seeds if all((number, seed) in tested for number in both)]
+    pairs = [[tested[number, seed] for seed in seeds] for number in both]
     differences = differences_of(final.search, *pairs) if seeds and chosen != CONTROL else ()
-    complete = final.judgement.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+    complete = final.test.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
     others = sorted({training_of(trial)[0] for trial in complete} - set(both))
     results, searched = tuple(final_results(now)), final.search.get_trials(deepcopy=False)
     of_others = [standing for number, standing in race.standings.items() if number != CONTROL]
-    return Judgement(
+    return StudyResult(
         chosen=chosen,
         results=results,
         differences=tuple(differences),
         n_seeds=len(seeds),
-        n_planned=len(final.judge_seeds),
+        n_planned=len(final.test_seeds),
         others=tuple(others),
         settings={name_of(each.number): " ".join(overrides_of(settings_of(searched, each.number))) for each in results},
-        n_unjudged=final.n_unjudged,
+        n_untested=final.n_untested,
         violated={number: each for number, each in final.violated().items() if number in race.standings},
         # Those of the first version have no checksum, and other seeds.
         is_repeated=any(
             not final.is_current(trial)
-            or (OF_CONFIG not in trial.user_attrs and training_of(trial)[1] not in final.judge_seeds)
+            or (OF_CONFIG not in trial.user_attrs and training_of(trial)[1] not in final.test_seeds)
             for trial in complete
         ),
         changes=[
             *notes_on(final.search),
             *code_notes(final.selection, "the trainings of the selection"),
-            *code_notes(final.judgement, "the trainings of the judgement"),
+            *code_notes(final.test, "the trainings on the test volumes"),
         ],
         have_others_failed=bool(of_others) and all(standing.has_failed for standing in of_others),
     )
