@@ -187,8 +187,8 @@ def check_stored_address(uri: str, own: Collection[str]) -> None:
     """
     if uri.rstrip("/") not in (each.rstrip("/") for each in own):
         raise UntrustedError(
-            f"{uri} is not a store that this user has used here: it could be sent this user's passwords, or have files "
-            f"written anywhere; give --tracking {uri} if it is yours"
+            f"{uri} is neither the default store nor one that a run of this user is pending in: it could be sent this "
+            f"user's passwords, or have files written anywhere; give --tracking {uri} if it is yours"
         )
 
 

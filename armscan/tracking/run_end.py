@@ -1,4 +1,4 @@
-"""Record the end of a run from another process than its own, such as the launcher of its grid or study."""
+"""Record the end of a run from a process other than its own, such as the launcher of its grid or study."""
 
 from __future__ import annotations
 

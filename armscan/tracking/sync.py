@@ -52,8 +52,8 @@ def sync(folder: Path, opened: Callable[[str], TrackingStore], *, trust: bool = 
     Args:
         folder: Folder of a run, of a study, or above them.
         opened: Function that opens a store by its address.
-        trust: Whether to write to runs tracked from other machines, and to upload files outside of a run's folder.
-            Default: False.
+        trust: Whether to write to runs that this machine has not recorded and whose tag names another folder, and to
+            upload files outside of a run's folder. Default: False.
 
     Returns:
         The outcome for each run that had entries left, is in use, or has a damaged outbox.

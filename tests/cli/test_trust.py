@@ -209,12 +209,15 @@ def test_server_that_only_a_folder_names_is_sent_nothing(armscan, tmp_path, monk
     monkeypatch.setattr("armscan.tracking.store._store", lambda uri, **_: opened.append(uri))
     code, printed, _ = armscan("runs", "sync", "theirs")
     assert code == 1
-    assert f"{uri} is not a store that this user has used here" in printed
+    assert f"{uri} is neither the default store nor one that a run of this user is pending in" in printed
     assert not opened
     # A stranger's outbox does not decide which stores are this user's.
     with contextlib.closing(Outbox(outbox.file)) as mine:
         mine.mark_pending("sqlite:///mlruns.db")
-    assert "is not a store that this user has used here" in armscan("runs", "sync", "theirs")[1]
+    assert (
+        "is neither the default store nor one that a run of this user is pending in"
+        in armscan("runs", "sync", "theirs")[1]
+    )
     assert not opened
 
 

@@ -35,10 +35,10 @@ class StudyResult:
         n_planned: Number of seeds planned for both.
         others: Other trials evaluated on the test volumes, because the study continued after its end.
         settings: Overrides of the chosen one and the control, by their names; an empty string without any.
-        n_untested: Number of trainings that have not ended. Default: 0.
+        n_untested: Number of trainings of the test that have not ended. Default: 0.
         have_others_failed: Whether a training of every other candidate failed in the race. Default: False.
         violated: Constraints of the study that configurations violated in the race. Default: none.
-        is_repeated: Whether trainings with an earlier configuration of the study ran there before. Default: False.
+        is_repeated: Whether trainings with an earlier configuration of the study were tested before. Default: False.
         changes: Notes on changes of the study's configuration and of armscan's code. Default: none.
     """
 

@@ -58,7 +58,7 @@ class FinalEvaluation:
         search: The study of the search.
         selection: The study of the trainings that choose a configuration.
         test: The study of the trainings on the test volumes.
-        config_sha256: `config_sha256_of` of the study, as its trainings have it here.
+        config_sha256: Checksum of the configuration that this process trains with; see `config_sha256_of`.
     """
 
     settings: FinalEvalSettings
@@ -71,13 +71,13 @@ class FinalEvaluation:
 
     @property
     def selection_seeds(self) -> range:
-        """The seeds of the selection, as many as one configuration may get; the search has not used one."""
+        """The seeds of the selection, as many as one configuration may get; the search has used none of them."""
         first = self.search_seed + SELECTION_SEEDS_ABOVE
         return range(first, first + MAX_SEEDS_FACTOR * self.settings.mean_seeds)
 
     @property
     def test_seeds(self) -> range:
-        """The seeds of the test; neither the search nor the selection has used one."""
+        """The seeds of the test; neither the search nor the selection has used any of them."""
         first = self.search_seed + TEST_SEEDS_ABOVE
         return range(first, first + self.settings.test_seeds)
 
@@ -186,7 +186,10 @@ class FinalEvaluation:
         return {training_of(trial): trial for trial in counted if trial.state == TrialState.COMPLETE}
 
     def blocked(self) -> list[str]:
-        """Return the names of the studies that failed trainings block: without a choice, or a seed of the test."""
+        """Return the names of the studies that failed trainings block.
+
+        They block the selection if it has no choice, and the test if it lacks a seed.
+        """
         race = self.race()
         wanted, ended = self.trainings_of_test(race), filter(_has_no_score, self._counted_trials(self.test))
         is_blocked = {
