@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tempfile
+from collections.abc import Sized
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -143,9 +144,12 @@ def _checked_facts(folder: Path) -> dict[str, Any]:
     model = Model.load(str(folder))
     facts = dict(model.metadata or {})
     example: Any = model.load_input_example(str(folder))
-    answers, n_action = onnx_answers(folder / ONNX_FILE, example), len(facts["action"])
-    if answers.ndim != 2 or answers.shape[1] != n_action or not np.isfinite(answers).all():
-        raise ExportError(f"for each observation, it must give as many finite numbers as the action has: {n_action}")
+    if not isinstance(action := facts.get("action"), Sized):
+        raise ExportError(f"the action in its metadata is {action!r}, but it must name its components")
+    answers = onnx_answers(folder / ONNX_FILE, example)
+    n_observations = len(next(iter(example.values())) if isinstance(example, dict) else example)
+    if answers.shape != (n_observations, len(action)) or not np.isfinite(answers).all():
+        raise ExportError(f"for each observation, it must give as many finite numbers as the action has: {len(action)}")
     if not isinstance(facts.get(DIFFERS, ""), str | None):
         raise ExportError(f"its {DIFFERS} must be a string")
     return facts

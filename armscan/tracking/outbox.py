@@ -66,6 +66,9 @@ class OutboxFile:
     """
 
     def __init__(self, file: Path) -> None:
+        # A pipe or a device would be read for ever.
+        if file.exists() and not file.is_file():
+            raise TrackingError(f"{file}: is not a file")
         self.file = file
         self._uploaded_file = file.with_suffix(UPLOADED)
         try:
@@ -140,9 +143,11 @@ class OutboxFile:
             entry = json.loads(line)
         except (ValueError, RecursionError):
             entry = None
-        if not isinstance(entry, dict):
-            raise TrackingError(f"{self.file}: a line is damaged: {line[:50]!r}")
-        return entry
+        if isinstance(entry, dict):
+            match entry.get("status", ["", 0]):
+                case [str(), int()]:
+                    return entry
+        raise TrackingError(f"{self.file}: a line is damaged: {line[:50]!r}")
 
     def _read_uploaded(self) -> dict[Channel, int]:
         """Return how far each channel is uploaded; ignore an invalid position, as uploading twice does no harm."""
@@ -187,8 +192,9 @@ class Outbox(OutboxFile):
         except Timeout as error:
             raise FolderInUseError(f"{file}: another process tracks this run") from error
         try:
-            truncate_torn_line(file)
+            # First, so that no file is truncated that is not an outbox.
             super().__init__(file)
+            truncate_torn_line(file)
             self._appending, self._adding = file.open("ab", buffering=0), threading.Lock()
             # Files that this process has added.
             self.added: set[str] = set()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -80,12 +80,12 @@ def _synced(files: Iterable[Path], opened: Callable[[str], TrackingStore], *, tr
                 is_open = is_dead and outbox.status not in ENDED and not _is_tracked_beside(file)
                 if outbox.is_uploaded and not is_open:
                     continue
-                # First, so that an interruption cannot leave an older status or description in the store.
-                waiting += _upload_again(outbox)
                 if isinstance(store := stores.get(uri) or _opened(opened, uri), TrackingError):
                     uploads.append(Upload(outbox.folder, run_id, 0, str(store)))
                 else:
-                    uploads.append(_upload_of(outbox, store, is_open=is_open, trust=trust))
+                    upload_, later = _upload_of(outbox, store, is_open=is_open, trust=trust)
+                    uploads.append(upload_)
+                    waiting += later
                 stores[uri] = store
         except FileNotFoundError:
             pending = _pending_of(file)
@@ -118,10 +118,10 @@ def _is_tracked_beside(file: Path) -> bool:
 
 
 def _outboxes_beside(file: Path) -> list[Path]:
-    """Return the other outboxes of a run, each in the folder of another command of its study."""
+    """Return the other outboxes of a run, each in the folder of another command of its study; links do not count."""
     file = file.resolve()
-    found = {each.resolve() for each in file.parents[2].glob(f"*/{file.parent.name}/{file.name}")}
-    return sorted(found - {file})
+    found = file.parents[2].glob(f"*/{file.parent.name}/{file.name}")
+    return sorted(each for each in found if each != file and each.resolve() == each and each.is_file())
 
 
 def _upload_again(outbox: Outbox) -> list[Path]:
@@ -132,7 +132,8 @@ def _upload_again(outbox: Outbox) -> list[Path]:
     """
     later = []
     for file in _outboxes_beside(outbox.file):
-        with contextlib.closing(Outbox(file, timeout_s=0.0)) as other:
+        # Damaged ones are reported where they are uploaded.
+        with contextlib.suppress(OSError, TrackingError), contextlib.closing(Outbox(file, timeout_s=0.0)) as other:
             if other.status_ms > outbox.status_ms:
                 other.mark("figures", 0)
                 later.append((other.status_ms, file))
@@ -163,25 +164,30 @@ def _opened(opened: Callable[[str], TrackingStore], uri: str) -> TrackingStore |
         return TrackingError(str(error))
 
 
-def _upload_of(outbox: Outbox, store: TrackingStore, *, is_open: bool, trust: bool) -> Upload:
+def _upload_of(outbox: Outbox, store: TrackingStore, *, is_open: bool, trust: bool) -> tuple[Upload, Sequence[Path]]:
+    """Upload an outbox; return the outcome, and the later outboxes of the run, which must be uploaded again."""
     n_entries, left = 0, None
     try:
         run = store.get_run(outbox.address.run_id)
         store.check_artifacts_of(run)
         if not trust:
             _check_own(outbox, run)
+        # First, so that an interruption cannot leave an older status or description in the store.
+        later = _upload_again(outbox)
         if is_open:
             _end(outbox, run)
+    except FolderInUseError:
+        raise
     # Any error of the store, or an untrusted folder.
     except Exception as error:
-        return Upload(outbox.folder, outbox.address.run_id, 0, reason_in(error))
+        return Upload(outbox.folder, outbox.address.run_id, 0, reason_in(error)), ()
     for channel in CHANNELS:
         try:
             n_entries += upload(outbox, store.mlflow, channel, is_whole=False, trust=trust)
         # Any error of the store: refused entries stay in the outbox, and the next channel may be accepted.
         except Exception as error:
             left = reason_in(error)
-    return Upload(outbox.folder, outbox.address.run_id, n_entries, left)
+    return Upload(outbox.folder, outbox.address.run_id, n_entries, left), later
 
 
 def _end(outbox: Outbox, run: Run) -> None:
@@ -201,7 +207,10 @@ def _end(outbox: Outbox, run: Run) -> None:
 def _check_own(outbox: Outbox, run: Run) -> None:
     """Raise `UntrustedError` unless the run was tracked from this folder, which could name any other."""
     folder, noted = outbox.folder.resolve(), run.data.tags.get(FOLDER_TAG)
-    if noted != str(folder) and _pending_of(outbox.file) is None:
+    # Of the commands of a study, the last to begin is noted.
+    pending = PendingRun.of(outbox.address.run_id)
+    own = () if pending is None else (pending.outbox.resolve(), *_outboxes_beside(pending.outbox))
+    if noted != str(folder) and outbox.file.resolve() not in own:
         raise UntrustedError(
             f"the run was not tracked from here on this machine, and its own folder is {noted or 'not known'}; if you "
             f"trust the author of {folder}, add {TRUST}"
@@ -224,7 +233,7 @@ def _upload_pending(store: TrackingStore) -> None:
     here = ProcessInfo.current()
     for run_id, pending in pending_runs().items():
         is_there = pending.outbox.exists()
-        uploads = _synced([pending.outbox], opened, trust=False)
+        uploads = _synced(sorted([pending.outbox, *_outboxes_beside(pending.outbox)]), opened, trust=False)
         for each in uploads:
             if each.n_entries:
                 entries = "1 entry" if each.n_entries == 1 else f"{each.n_entries} entries"

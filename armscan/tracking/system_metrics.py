@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -41,8 +42,10 @@ class SystemMetrics:
                 monitor.collect_metrics()
                 metrics |= {f"{PREFIX}{name}": float(value) for name, value in monitor.aggregate_metrics().items()}
                 monitor.clear_metrics()
-            self._take(metrics, self._number)
-            self._number += 1
+            # On a full disk the sample is left out, and the next one is taken.
+            with contextlib.suppress(OSError):
+                self._take(metrics, self._number)
+                self._number += 1
 
 
 def _monitors() -> list[Any]:

@@ -241,7 +241,7 @@ def damaged(network, how):
     for node in graph.node:
         node.output[:] = ["before" if name == last else name for name in node.output]
     graph.output[0].type.tensor_type.ClearField("shape")
-    values = {"true": np.array(True), "zero": np.array(0, np.float32)}
+    values = {"true": np.array(True), "zero": np.array(0, np.float32), "one": np.array([0])}
     graph.initializer.extend(numpy_helper.from_array(value, name) for name, value in values.items())
     kinds = [("n", TensorProto.INT64, []), ("again", TensorProto.BOOL, []), ("kept", TensorProto.FLOAT, None)]
     same = [helper.make_node("Identity", [name], [f"{name}_after"]) for name in ("again", "kept")]
@@ -251,6 +251,7 @@ def damaged(network, how):
     last_node = {
         "endless": helper.make_node("Loop", ["", "true", "before"], [last], body=loop),
         "infinite": helper.make_node("Div", ["before", "zero"], [last]),
+        "first": helper.make_node("Gather", ["before", "one"], [last], axis=0),
         "wider": helper.make_node("Concat", ["before", "before"], [last], axis=1),
     }[how]
     graph.node.append(last_node)
@@ -275,7 +276,7 @@ def test_model_that_does_not_answer_is_not_registered_and_only_one_line_told(ans
     is_refused("")
     program.write_bytes(damaged(network, "endless"))
     is_refused("policy.onnx has not answered within 1 s")
-    for how in ("infinite", "wider"):
+    for how in ("infinite", "wider", "first"):
         program.write_bytes(damaged(network, how))
         is_refused("for each observation, it must give as many finite numbers as the action has: 1")
     program.write_bytes(network)

@@ -51,10 +51,12 @@ def test_outbox_of_an_earlier_command_leaves_the_later_result(database, run_id, 
         upload_all(tmp_path)
     add_command(database, run_id, first, at_ms=1_000, status="KILLED", reason="by hand", note="old", value=0.1)
     add_command(database, run_id, second, at_ms=2_000, status="FAILED", reason="worse", value=0.2)
+    # Of the commands of a study, the last to begin is the one that is pending; it may not be the last to end.
+    begin_outbox(second, run_id, database).close()
     if who == "a start":
-        begin_outbox(first, run_id, database).close()
         _upload_pending(open_existing_store(database))
-    upload_all(tmp_path)
+    else:
+        assert not any(each.left for each in sync(tmp_path, open_existing_store))
     assert result_of(database, run_id) == ("FINISHED", 3_010, None, "the result", 0.3)
     assert upload_all(tmp_path) == []
 
@@ -96,3 +98,34 @@ def test_interrupted_upload_of_an_earlier_outbox_is_made_good(database, run_id, 
     assert json.loads(file_of(tmp_path / "2", run_id).with_suffix(".delivered.json").read_text())["figures"] == 0
     upload_all(tmp_path)
     assert result_of(database, run_id) == ("FINISHED", 2_010, None, "the result", 0.2)
+
+
+@pytest.mark.parametrize("link", ["", "tracking", "tracking/{}.jsonl"])
+def test_link_beside_an_outbox_is_not_followed(database, run_id, tmp_path, tmp_path_factory, link):
+    add_command(database, run_id, tmp_path / "1", at_ms=1_000, status="FINISHED", note="the result")
+    target = tmp_path_factory.mktemp("user") / "2" / "tracking" / f"{run_id}.jsonl"
+    target.parent.mkdir(parents=True)
+    target.write_bytes(bytes(200))
+    place = tmp_path / "2" / link.format(run_id)
+    place.parent.mkdir(parents=True, exist_ok=True)
+    place.symlink_to(target.parents[1] / link.format(run_id))
+    assert file_of(tmp_path / "2", run_id).read_bytes() == bytes(200)
+    begin_outbox(tmp_path / "1", run_id, database).close()
+    sync(tmp_path, open_existing_store)
+    assert result_of(database, run_id)[0] == "FINISHED"
+    assert target.read_bytes() == bytes(200)
+    assert [each.name for each in target.parent.iterdir()] == [target.name]
+
+
+@pytest.mark.parametrize(
+    "damage", [b"", b"nonsense", b'{"address": 3}\n', b'{"status": []}\n', b'{"status": ["FINISHED", "9"]}\n']
+)
+def test_damaged_outbox_does_not_stop_the_others_of_the_run(database, run_id, tmp_path, damage):
+    add_command(database, run_id, tmp_path / "1", at_ms=1_000, status="FINISHED", note="the result", value=0.1)
+    add_command(database, run_id, tmp_path / "2", at_ms=2_000, status="KILLED")
+    file = file_of(tmp_path / "2", run_id)
+    file.write_bytes(file.read_bytes() + damage if b"status" in damage else damage)
+    lefts = [each.left for each in upload_all(tmp_path)]
+    assert lefts[0] is None
+    assert str(file) in lefts[1]
+    assert result_of(database, run_id)[::3] == ("FINISHED", "the result")

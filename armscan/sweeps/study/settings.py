@@ -114,10 +114,14 @@ class FinalEvalSettings(Section):
     @model_validator(mode="before")
     @classmethod
     def _of_earlier_versions(cls, values: Any) -> Any:
-        """Take `n_seeds` or `judge_seeds` of a sweep that was written for an earlier version as `test_seeds`."""
-        if not isinstance(values, Mapping):
+        """Take stored `judge_seeds` as `test_seeds`; refuse old names in a sweep, beside the new default."""
+        if not isinstance(values, Mapping) or not (old := {"n_seeds", "judge_seeds"} & values.keys()):
             return values
-        return {"test_seeds" if key in ("n_seeds", "judge_seeds") else key: value for key, value in values.items()}
+        if "test_seeds" in values:
+            raise InvalidValueError(
+                f"study.final_eval.{min(old)} is now study.final_eval.test_seeds: rename it in the sweep"
+            )
+        return {"test_seeds" if key in old else key: value for key, value in values.items()}
 
     @model_validator(mode="after")
     def _fewest_first(self) -> Self:

@@ -9,7 +9,7 @@ import optuna
 import pytest
 from optuna.trial import TrialState
 
-from armscan.errors import StudyError
+from armscan.errors import InvalidValueError, StudyError
 from armscan.stats.bootstrap import Estimate
 from armscan.stats.paired import paired_difference
 from armscan.sweeps.results import difference as difference_module
@@ -403,9 +403,12 @@ def test_latest_trial_of_each_member_is_trained_with_its_whole_schedule(storage_
 
 
 @pytest.mark.parametrize("name", ["n_seeds", "judge_seeds"])
-def test_settings_of_an_earlier_version_are_read(name):
+def test_stored_settings_of_an_earlier_version_are_read_and_those_of_a_sweep_refused(name):
     before = {"top_k": 2, "min_seeds": 2, "mean_seeds": 4, name: 7}
     assert FinalEvalSettings.read("a", before).model_dump() == FINAL_EVAL | {"test_seeds": 7, "episodes": None}
+    # The default, or the command line, sets the new name.
+    with pytest.raises(InvalidValueError, match=rf"study\.final_eval\.{name} is now study\.final_eval\.test_seeds"):
+        FinalEvalSettings.read("a", before | {"test_seeds": 5})
 
 
 def test_nothing_is_left_of_a_final_evaluation_whose_trainings_all_failed(storage_uri):
