@@ -200,7 +200,7 @@ def _column(rows: Sequence[Row], task: str) -> Mapping[str, str]:
     signs = np.sign((scores[ARMSCAN] - scores[HYDRA]).mean(axis=1))
     return {
         "replicates": f"{len(replicates)}",
-        "processor s of each search: armscan, Hydra": ", ".join(mean(side, "processor_s") for side in SEARCHES),
+        "processor s spent: armscan, Hydra": ", ".join(mean(side, "processor_s") for side in SEARCHES),
         "trials: armscan, of them pruned; trainings of its race": (
             f"{mean(ARMSCAN, 'n_trials')}, {mean(ARMSCAN, 'n_pruned')}; {mean(ARMSCAN, 'n_raced')}"
         ),
