@@ -90,7 +90,7 @@ class Grid:
 
     def write(self, folder: Path) -> None:
         """Write the grid into its folder."""
-        (folder / GRID_FILE).write_text(json.dumps(asdict(self)))
+        atomic_write(folder / GRID_FILE, json.dumps(asdict(self)))
 
     @property
     def uri(self) -> str:

@@ -75,7 +75,10 @@ def jobs_table(outcomes: Mapping[str, JobOutcome], run_ids: Mapping[str, str], *
         "outcome": [ended.get(outcome.failure, "failed") for outcome in outcomes.values()],
     }
     n_baselines = len(results) - len(outcomes)
-    names = {number: f"{number} ({outcome.varied})" for number, outcome in outcomes.items()}
+    names = {
+        number: f"{number} ({outcome.varied})" if outcome.varied else f"job {number}"
+        for number, outcome in outcomes.items()
+    }
     randoms = {names[number]: each[RANDOM] for number, each in baselines.items() if RANDOM in each}
     return ResultTable(
         results,

@@ -142,10 +142,14 @@ class Multirun(Callback):
             is_trusted=Multirun.is_trusted,
             launcher=ProcessInfo.current() if launcher in ON_THIS_MACHINE else None,
         )
-        grid.write(folder)
-        Multirun.folder, Multirun.grid = folder, grid
-        Multirun.outbox = begin_outbox(folder, run.info.run_id, tracking["uri"])
-        Multirun.launcher = launcher
+        try:
+            grid.write(folder)
+            Multirun.outbox = begin_outbox(folder, run.info.run_id, tracking["uri"])
+        # A full disk: the run would stay RUNNING.
+        except OSError:
+            store.delete_run(run.info.run_id)
+            raise
+        Multirun.folder, Multirun.grid, Multirun.launcher = folder, grid, launcher
 
 
 def _check_not_continued(store: TrackingStore, experiment_id: str, run_id: str) -> None:
@@ -190,6 +194,9 @@ def end_grid(*, is_interrupted: bool = False) -> int:
     except (TrackingError, OSError) as error:
         again = armscan_command("runs", "sync", str(folder))
         print(f"{one_line_message(error) or error}; {again} uploads the rest", file=sys.stderr)
+        if outcomes:
+            table_command = armscan_command("report", "--runs", grid.run_id, tracking=grid.uri)
+            print(f"the grid's run lacks the table of its jobs; {table_command} makes one", file=sys.stderr)
         store, runs = None, []
     if outcomes:
         from armscan.experiment.console import print_where_to_look

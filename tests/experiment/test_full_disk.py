@@ -10,7 +10,7 @@ import pytest
 from tests.experiment.test_resume import LONGER, after_epochs, assert_ended_alike, finish
 from tests.support.processes import COMMAND
 from tests.support.waiting import HANG_S, wait_until
-from tests.test_run import armscan_run, runs_in
+from tests.test_run import SMALL, armscan_run, runs_in
 
 pytestmark = pytest.mark.slow
 FULL = "No space left on device"
@@ -79,3 +79,12 @@ def test_grid_whose_folder_is_full_tells_the_cause_and_how_to_resume_it(disk, tm
     assert again.returncode == 0, again.stderr
     # The new grid and both jobs; a job without a checkpoint has begun again as a new run.
     assert [run.info.status for run in runs_in(tmp_path)[1]].count("FINISHED") == 3
+
+
+def test_grid_that_begins_on_a_full_disk_leaves_no_run(disk, tmp_path):
+    disk.fill()
+    refused = armscan_run("-m", "seed=1,2", *SMALL, f"hydra.sweep.dir={disk.folder}/grid", cwd=tmp_path)
+    assert refused.returncode == 2
+    assert refused.stderr.startswith(f"error: {disk.folder}/grid")
+    assert refused.stderr.endswith(f": {FULL}\n")
+    assert runs_in(tmp_path)[1] == []
