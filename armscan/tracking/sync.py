@@ -83,8 +83,8 @@ def _synced(files: Iterable[Path], opened: Callable[[str], TrackingStore], *, tr
                 if isinstance(store := stores.get(uri) or _opened(opened, uri), TrackingError):
                     uploads.append(Upload(outbox.folder, run_id, 0, str(store)))
                 else:
-                    upload_, later = _upload_of(outbox, store, is_open=is_open, trust=trust)
-                    uploads.append(upload_)
+                    outcome, later = _upload_of(outbox, store, is_open=is_open, trust=trust)
+                    uploads.append(outcome)
                     waiting += later
                 stores[uri] = store
         except FileNotFoundError:

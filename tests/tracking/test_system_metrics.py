@@ -1,5 +1,7 @@
 """System metrics, sampled while a run trains."""
 
+import errno
+import os
 import threading
 
 import pytest
@@ -31,6 +33,20 @@ def test_system_metrics_look_now_and_then_and_once_at_the_end():
         assert 0 <= figures["system/cpu_utilization_percentage"] <= 100
         assert figures["system/disk_available_megabytes"] > 0
     assert not threads()
+
+
+def test_system_metrics_go_on_after_a_full_disk():
+    numbers = []
+
+    def take(_, number):
+        numbers.append(number)
+        if len(numbers) == 1:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    metrics = SystemMetrics(take, every_s=0.05, first=7)
+    wait_until(lambda: len(numbers) >= 3)
+    metrics.finish()
+    assert numbers[:3] == [7, 7, 8]
 
 
 def test_system_metrics_of_a_run_end_with_its_training_and_go_on_with_it(store, tmp_path):
