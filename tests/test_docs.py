@@ -252,6 +252,13 @@ def test_page_links_to_what_is_there(page):
         assert (page.parent / target).exists(), target
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_page_hides_no_line_of_its_text(page):
+    # To Sphinx's reader of Markdown, such a line is a comment; a per cent sign gets there when text is wrapped.
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
+    assert re.findall(r"^\s*%.*", text, re.MULTILINE) == []
+
+
 def test_readme_is_short():
     assert len((REPOSITORY / "README.md").read_text().split()) <= 800
 
