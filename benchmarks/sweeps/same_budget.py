@@ -58,8 +58,9 @@ TASKS = {
 ARMSCAN, HYDRA, DEFAULT = "armscan", "hydra", "default"
 Search = Callable[[Sequence[str], float, Path], SearchResult]
 SEARCHES: dict[str, Search] = {ARMSCAN: search_by_armscan, HYDRA: search_by_hydra}
-# First seed of the comparison; seeds of searches begin at 0, seeds of races 1000 above.
-FIRST_SEED, SEEDS_APART = 5000, 10
+# First seed of the comparison; seeds of searches begin at 0, seeds of races 1000 above. Ten successive seeds belong to
+# a replicate, and ten more a thousand further on.
+FIRST_SEED, SEEDS_APART, TENS_APART = 5000, 10, 1000
 OBJECTIVE = "mean_steps"
 SHORT = ("training.env_steps=3000", "training.eval_every_env_steps=1000")
 Row = dict[str, Any]
@@ -98,8 +99,6 @@ def same_budget(
     """
     if unknown := [name for name in tasks if name not in TASKS]:
         raise InvalidValueError(f"--tasks: {unknown[0]!r} is none of {', '.join(TASKS)}")
-    if seeds > SEEDS_APART:
-        raise InvalidValueError(f"--seeds is {seeds}, but replicates have {SEEDS_APART} seeds of their own, no more")
     silence_libraries()
     results = Results(folder / "results.jsonl")
     if not replicates and not results.rows:
@@ -123,12 +122,14 @@ def _replicate(results: Results, name: str, replicate: int, n_seeds: int) -> Non
             print(name, replicate, side, result, flush=True)
             results.add(**known, side=side, **asdict(result))
     best = {DEFAULT: {}, **{side: results.find(side=side, **known)["values"] for side in SEARCHES}}
-    for seed in range(FIRST_SEED + SEEDS_APART * replicate, FIRST_SEED + SEEDS_APART * replicate + n_seeds):
+    for place in range(n_seeds):
+        tens, ones = divmod(place, SEEDS_APART)
+        seed = FIRST_SEED + TENS_APART * tens + SEEDS_APART * replicate + ones
         for values in best.values():
             if results.find(task=name, values=values, seed=seed) is None:
                 _, evaluations = train_and_evaluate(task.words, values, seed)
                 of_volumes = evaluations[TEST].by_volume()
-                scores = {volume: each.metrics()[OBJECTIVE] for volume, each in of_volumes.items()}
+                scores = {volume: round(each.metrics()[OBJECTIVE], 6) for volume, each in of_volumes.items()}
                 results.add(**known, values=values, seed=seed, scores=scores)
 
 

@@ -58,7 +58,7 @@ def test_chance_is_as_large_as_in_the_table(surrogate):
     assert np.sqrt(logs.var(axis=1).mean()) == pytest.approx(0.103, rel=0.1)
 
 
-@pytest.mark.parametrize("pruner", ["none", "median", "halving"])
+@pytest.mark.parametrize("pruner", ["none", "percentile", "median", "halving"])
 def test_a_search_ends_when_its_budget_is_spent(surrogate, pruner):
     found = search(surrogate, "sac_y", Rule("random", pruner), n_trainings=20, seed=0)
     assert 20 <= found.n_trainings < 21

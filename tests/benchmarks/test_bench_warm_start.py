@@ -44,3 +44,12 @@ def test_a_warm_start_from_the_same_space_saves_trials(surrogate):
     assert not studies["trials"].T.duplicated().any()
     # Without pruning, each trial is a training.
     assert (studies["trainings"] == studies["trials"]).all(axis=None)
+
+
+def test_studies_that_begin_with_nothing_may_have_another_pruner(surrogate):
+    target, pruned = (SimulatedSweep("sac_y", surrogate, Rule("tpe", pruner), 20) for pruner in ("none", "median"))
+    alike, studies = replays(pruned, pruned, 3), replays(pruned, target, 3, cold=pruned)
+    assert studies["trials"][[*COLD]].equals(alike["trials"][[*COLD]])
+    # One more than all trials without pruning.
+    assert (studies["trials"].preset == 21).all()
+    assert (alike["trials"].preset > 21).all()

@@ -127,6 +127,17 @@ def test_replicates_have_seeds_of_their_own(trained, tmp_path):
     assert sorted(of_default) == sorted(2 * [5000, 5001, 5002, 5010, 5011, 5012])
 
 
+@pytest.mark.parametrize("n_seeds", [8, 32])
+def test_more_seeds_of_a_comparison_begin_with_the_same_ones(trained, tmp_path, n_seeds):
+    same_budget.same_budget(tmp_path, tasks=["sac_y"], replicates=3, seeds=n_seeds)
+    seeds = {}
+    for row in Results(tmp_path / "results.jsonl").rows:
+        if "seed" in row:
+            seeds.setdefault(row["replicate"], set()).add(row["seed"])
+    assert all(set(range(5000 + 10 * replicate, 5008 + 10 * replicate)) <= own for replicate, own in seeds.items())
+    assert len(set.union(*seeds.values())) == 3 * n_seeds, "no two replicates share a seed"
+
+
 def test_processes_share_a_folder(trained, tmp_path):
     for first in (2, 0):
         same_budget.same_budget(tmp_path, tasks=["sac_y"], first=first, replicates=2, seeds=1)

@@ -42,6 +42,8 @@ from armscan.utils.text import counted
 PRESET, SOURCE = "preset {}", "study {}"
 # Number of best settings that are tried first, of a study with another configuration.
 N_ENQUEUED = 10
+# It would prune most trials that follow good ones (docs/sweep-bench.md#warm-start).
+MEDIAN_PRUNER = "optuna.pruners.MedianPruner"
 # In `study.enqueue`: the configuration of the study itself.
 DEFAULT = "default"
 # User attributes that a taken trial keeps.
@@ -178,6 +180,8 @@ def _of_study(
     params_of = {repr(settings_of[trial.number]): renamed(trial.params) for trial in reversed(best)}
     if moved := [values for each in first if (values := _moved(params_of[repr(each)], each))]:
         message += f", {len(moved)} of them with the nearest values of the space, such as {moved[0]}"
+    if first and settings.pruner["_target_"] == MEDIAN_PRUNER:
+        message += "; study/pruner=percentile prunes fewer of the trials after them than median"
     return InitialTrials(SOURCE.format(name), message + left, (), first)
 
 

@@ -4,7 +4,7 @@ python -m benchmarks.sweeps.bench collect sac_y [--configs N] [--seeds N] [--wor
 python -m benchmarks.sweeps.bench report sac_y [--studies N] [--workers N] [--picture FILE]
 python -m benchmarks.sweeps.bench collect-episodes sac_y [--seeds N] [--workers N]
 python -m benchmarks.sweeps.bench report-episodes sac_y [--studies N]
-python -m benchmarks.sweeps.bench warm-start sac_y sac_zy [--studies N] [--pruner NAME]
+python -m benchmarks.sweeps.bench warm-start sac_y sac_zy [--studies N] [--pruner NAME] [--cold-pruner NAME]
 """
 
 from __future__ import annotations
@@ -63,6 +63,7 @@ def main() -> None:
     starting.add_argument("target", help="name of the sweep that begins with them, such as sac_zy")
     starting.add_argument("--studies", type=count, default=20, help="studies (default: 20)")
     starting.add_argument("--pruner", default=DEFAULT.pruner, help=f"pruner of the target (default: {DEFAULT.pruner})")
+    starting.add_argument("--cold-pruner", help="pruner of studies that begin with nothing (default: --pruner)")
     _run(parser.parse_args())
 
 
@@ -79,7 +80,8 @@ def _run(given: argparse.Namespace) -> None:
         return
     if given.command == "warm-start":
         target = SimulatedSweep.of(given.target, given.pruner)
-        studies = replays(SimulatedSweep.of(given.source), target, given.studies)
+        cold = SimulatedSweep.of(given.target, given.cold_pruner or given.pruner)
+        studies = replays(SimulatedSweep.of(given.source), target, given.studies, cold)
         print(studies.to_string())
         for kind, n_reached in studies["reached"].sum().items():
             print(f"{kind}: {n_reached:.0f} of {len(studies)} reach the goal")

@@ -54,7 +54,9 @@ class SimulatedSweep(NamedTuple):
         return cls(sweep, Surrogate.of(Curves.read(sweep)), rule, study.n_trials)
 
 
-def replays(source: SimulatedSweep, target: SimulatedSweep, n_studies: int) -> pd.DataFrame:
+def replays(
+    source: SimulatedSweep, target: SimulatedSweep, n_studies: int, cold: SimulatedSweep | None = None
+) -> pd.DataFrame:
     """Simulate each study cold, with a warm start, with the presets of the sweep, with both, and independently.
 
     A warm start tries the best settings of a study of the source with the same seed first. The independent study is
@@ -65,19 +67,20 @@ def replays(source: SimulatedSweep, target: SimulatedSweep, n_studies: int) -> p
         source: Sweep whose best settings are tried first.
         target: Sweep that is searched.
         n_studies: Number of studies of each kind.
+        cold: The same sweep, as studies search it that begin with nothing. Default: `target`.
 
     Returns:
         A row for each study, with columns (`trials`, `trainings` or `reached`, one of `COLD` or of `BEGUN`): the number
         until the truly best settings of the cold study, or better ones, have run to their end, one more than all if
         they never do; and 1 if they do, else 0.
     """
-    presets = presets_of(target.sweep, target.surrogate.space)
+    cold, presets = cold or target, presets_of(target.sweep, target.surrogate.space)
     rows = []
     for seed in range(n_studies):
         known = best_that_fit(_search(source, seed), target.surrogate.space)
         searches = {
-            "cold": _search(target, seed),
-            "independent": _search(target, n_studies + seed),
+            "cold": _search(cold, seed),
+            "independent": _search(cold, n_studies + seed),
             "warm": _search(target, seed, known),
             "preset": _search(target, seed, presets),
             "preset, warm": _search(target, seed, (*presets, *known)),

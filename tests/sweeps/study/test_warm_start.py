@@ -145,6 +145,18 @@ def test_best_settings_of_another_configuration_are_tried_first_without_their_va
     assert {trial.state for trial in made[2].trials} == {TrialState.WAITING}
 
 
+@pytest.mark.parametrize(("pruner", "is_hinted"), [("Median", True), ("Nop", False)])
+def test_settings_tried_first_with_the_median_pruner_have_a_hint(study_in, pruner, is_hinted):
+    study_in("before", {"agent.lr": LR}, rows=[({"agent.lr": 2e-3}, 2.0)])
+    changes = {"warm_start": ["before"], "pruner": {"_target_": f"optuna.pruners.{pruner}Pruner"}}
+    (told,) = begin(study_in("now", {"agent.lr": LR}, ZY, **changes), ZY)
+    assert "the settings of the best 1 are tried first" in told
+    assert ("study/pruner=percentile prunes fewer" in told) == is_hinted
+    # Trials with their values are a sample of the space, which a median suits.
+    (told,) = begin(study_in("again", {"agent.lr": LR}, **changes))
+    assert told.endswith("1 taken with their values")
+
+
 def test_numbers_outside_of_the_space_are_tried_with_their_nearest_values(study_in):
     rows = [
         ({"agent.gamma": 0.99, "agent.lr": 1e-4, "network": "mlp"}, 1.0),
