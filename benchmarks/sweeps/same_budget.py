@@ -61,6 +61,7 @@ SEARCHES: dict[str, Search] = {ARMSCAN: search_by_armscan, HYDRA: search_by_hydr
 # First seed of the comparison; seeds of searches begin at 0, seeds of races 1000 above. Ten successive seeds belong to
 # a replicate, and ten more a thousand further on.
 FIRST_SEED, SEEDS_APART, TENS_APART = 5000, 10, 1000
+MAX_REPLICATES = TENS_APART // SEEDS_APART
 OBJECTIVE = "mean_steps"
 SHORT = ("training.env_steps=3000", "training.eval_every_env_steps=1000")
 Row = dict[str, Any]
@@ -99,6 +100,10 @@ def same_budget(
     """
     if unknown := [name for name in tasks if name not in TASKS]:
         raise InvalidValueError(f"--tasks: {unknown[0]!r} is none of {', '.join(TASKS)}")
+    if first + replicates > MAX_REPLICATES:
+        raise InvalidValueError(
+            f"--first is {first} and --replicates {replicates}, but only {MAX_REPLICATES} have seeds of their own"
+        )
     silence_libraries()
     results = Results(folder / "results.jsonl")
     if not replicates and not results.rows:

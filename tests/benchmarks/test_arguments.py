@@ -56,7 +56,7 @@ def test_a_folder_without_volumes_ends_in_one_line(
         ("learning.distance", []),
         ("learning.profiles", ["FOLDER", "--phantoms", "0"]),
         ("sweeps", ["compare", "--trails", "3"]),
-        ("sweeps", ["same-budget", "--seeds", "11"]),
+        ("sweeps", ["same-budget", "--first", "99", "--replicates", "2"]),
         ("sweeps.bench", ["collect", "unknown"]),
         ("sweeps.bench", ["warm-start", "sac_y", "sac_zy", "--studies", "0"]),
         ("sweeps.bench", ["report", "sac_y", "--picture", "no/folder/picture.png"]),
