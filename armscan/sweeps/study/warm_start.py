@@ -181,7 +181,7 @@ def _of_study(
     if moved := [values for each in first if (values := _moved(params_of[repr(each)], each))]:
         message += f", {len(moved)} of them with the nearest values of the space, such as {moved[0]}"
     if first and settings.pruner["_target_"] == MEDIAN_PRUNER:
-        message += "; study/pruner=percentile prunes fewer of the trials after them than median"
+        message += "; study/pruner=percentile prunes fewer of the trials that follow than median does"
     return InitialTrials(SOURCE.format(name), message + left, (), first)
 
 
