@@ -35,7 +35,7 @@ from armscan.sweeps.storage.attributes import FINAL_SUFFIXES, check_trials
 from armscan.sweeps.storage.reports import REPORT
 from armscan.sweeps.storage.storage import Storage, existing_storage
 from armscan.sweeps.study.fixed_config import comparable_settings, config_changes, differing, fixed_of
-from armscan.sweeps.study.settings import StudySettings
+from armscan.sweeps.study.settings import OPTUNA_PRUNERS, StudySettings
 from armscan.sweeps.study.study import best_trials, is_ours
 from armscan.utils.text import counted
 
@@ -43,7 +43,7 @@ PRESET, SOURCE = "preset {}", "study {}"
 # Number of best settings that are tried first, of a study with another configuration.
 N_ENQUEUED = 10
 # It would prune most trials that follow good ones (docs/sweep-bench.md#warm-start).
-MEDIAN_PRUNER = "optuna.pruners.MedianPruner"
+MEDIAN_PRUNER = f"{OPTUNA_PRUNERS}MedianPruner"
 # In `study.enqueue`: the configuration of the study itself.
 DEFAULT = "default"
 # User attributes that a taken trial keeps.
