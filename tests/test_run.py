@@ -280,6 +280,8 @@ def test_run_trains_on_labelmap_files(tmp_path, data_folder):
         (["agent=[sac,ppo]"], "'agent=[sac,ppo]' is not allowed: a run has one agent, agent=NAME"),
         (["-m", "agent=glob([rand*])", "seed=-1"], "seed is -1, but it must be"),
         (["~data"], "'~data' is not allowed: a run has one data, data=NAME"),
+        (["-m", "+sweep=sac_y"], "'+sweep=sac_y' is not allowed: a study is sweep=NAME"),
+        (["-m", "sweep/lab=mine", "--plan"], "'sweep/lab=mine' is not allowed: a study is sweep=NAME"),
         (["-m", "obs=[cluster],slice", "--plan"], "'obs=[cluster],slice' is not allowed: a run has one obs"),
         (
             ["data.path=wrists"],

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from armscan.agents.policy import Policy
 
 # Optional attributes of a learner that evaluations and runs read.
-OPTIONAL = ("validation_note", "warm_up_note", "expected_error", "expected_errors")
+OPTIONAL = ("validation_note", "warm_up_note", "weights_note", "expected_error", "expected_errors")
 
 
 class ScheduledLearner:

@@ -17,7 +17,7 @@ from armscan.cli.options import (
     tracking_option,
     trust_option,
 )
-from armscan.config.defaults import CHANGES, default_tracking
+from armscan.config.defaults import CHANGES, PHANTOM, default_tracking
 from armscan.errors import InvalidValueError
 from armscan.stats.on_plane import ON_PLANE_KEY
 from armscan.utils.console import wide_console
@@ -122,7 +122,7 @@ def evaluate(
     changes = {name: value for name, value in rules.items() if value is not None}
     _check_arguments(run, agent, data, changes)
     _check_options(agent, data, tracking_experiment, video=video)
-    folder = None if data == "phantom" else data
+    folder = None if data == PHANTOM else data
     print(f"preparing {f'run {run[0]}' if agent is None else f'agent={agent}'}", flush=True)
     # Deferred: command-line errors are reported before these are loaded.
     from armscan import evaluation
@@ -179,7 +179,7 @@ def _evaluate(
 
 def _check_options(agent: str | None, data: str | None, tracking_experiment: str | None, *, video: bool) -> None:
     """Raise an error if options exclude each other, or the folder does not exist."""
-    if is_given("phantoms") and data != "phantom":
+    if is_given("phantoms") and data != PHANTOM:
         number = click.get_current_context().params["phantoms"]
         raise click.UsageError(f"--phantoms is {number}, but it requires --data phantom")
     if tracking_experiment is not None and (agent is None or video):
@@ -187,7 +187,7 @@ def _check_options(agent: str | None, data: str | None, tracking_experiment: str
             "--tracking-experiment is for --agent without --video: the evaluation of a run is tracked in the run's "
             "own experiment, a video not at all"
         )
-    if data not in (None, "phantom") and not Path(str(data)).is_dir():
+    if data not in (None, PHANTOM) and not Path(str(data)).is_dir():
         what = "that is a file" if Path(str(data)).exists() else "there is no such folder"
         raise InvalidValueError(f"--data is {data!r}, but {what}: it must be a folder of volumes, or phantom")
 

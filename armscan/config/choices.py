@@ -21,8 +21,10 @@ def choices() -> dict[str, dict[str, Path]]:
     found: dict[str, dict[str, Path]] = {}
     for root, prefix in roots:
         for path in yaml_files(root) if root is not None else ():
-            group = Path(prefix, path.parent.relative_to(root)).as_posix() if root is not None else ""
-            found.setdefault(group, {})[path.stem] = path
+            name = path.relative_to(root).with_suffix("") if root is not None else path
+            # Studies in a subfolder are choices of the same group: sweep=FOLDER/NAME.
+            group, choice = (prefix, name.as_posix()) if prefix else (name.parent.as_posix(), name.name)
+            found.setdefault(group, {})[choice] = path
     return dict(sorted(found.items()))
 
 

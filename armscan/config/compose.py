@@ -34,6 +34,7 @@ from armscan.config.sources import (
     own_folders,
     replaced_files,
     sweeps_folder,
+    yaml_files,
 )
 from armscan.errors import InvalidValueError, few
 
@@ -67,7 +68,8 @@ class SweepsSource(FileConfigSource):
         """Return the studies of the folder; for a parent of the folder, the group."""
         if not config_path:
             return [] if results_filter == ObjectType.CONFIG else [SWEEP]
-        names = sorted(path.stem for path in Path(self.path).glob("*.yaml"))
+        folder = Path(self.path)
+        names = [path.relative_to(folder).with_suffix("").as_posix() for path in yaml_files(folder)]
         return [] if results_filter == ObjectType.GROUP else names
 
 

@@ -22,6 +22,8 @@ from armscan.errors import ArmscanError, in_one_line, listed, print_error
 from armscan.utils.files import FULL_DISK
 
 TRACEBACKS = "ARMSCAN_TRACEBACKS"
+# Modules that read configurations, and Python's own that decode text.
+OF_CONFIGURATION, DECODING = ("hydra.", "omegaconf.", "yaml."), ("codecs", "encodings.utf_8")
 # Keys of a folder of volumes, which phantoms do not have.
 OF_FOLDER = ("data.path", "data.folds", "data.fold", "data.validation", "data.test")
 
@@ -61,10 +63,13 @@ def one_line_message(error: BaseException) -> str | None:
             return f"{text.rpartition('full_key: ')[2]}._target_ cannot be imported: {_why_not_imported(failed)}"
         case HydraException() | OmegaConfBaseException():
             return text
+        case UnicodeDecodeError():
+            what = "a file of the configuration" if _module_of(error).startswith(OF_CONFIGURATION) else "a file"
+            return f"{what} cannot be read: {text}"
         # Raised by Hydra for an override such as obs=null.
         case ValueError() if _module_of(error).startswith("hydra."):
             return text
-        case YAMLError() | UnicodeDecodeError():
+        case YAMLError():
             return f"a file of the configuration cannot be read: {text}"
         case OSError() if error.filename is not None:
             return f"{error.filename}: {error.strerror}"
@@ -99,9 +104,10 @@ def _armscan_error(error: BaseException | None) -> ArmscanError | None:
 
 
 def _module_of(error: BaseException) -> str:
-    """Return the name of the module that raised an error."""
-    *_, (frame, _) = traceback.walk_tb(error.__traceback__)
-    return str(frame.f_globals.get("__name__"))
+    """Return the name of the module that raised an error; empty if nothing raised it in this process."""
+    modules = [str(frame.f_globals.get("__name__")) for frame, _ in traceback.walk_tb(error.__traceback__)]
+    # An error from another process has no frames; text is decoded by Python's own modules.
+    return next((each for each in reversed(modules) if each not in DECODING), "")
 
 
 def _unknown_key(error: ConfigAttributeError | ConfigKeyError) -> str:

@@ -16,7 +16,7 @@ from armscan.experiment.results import few_subjects
 from armscan.stats.bootstrap import LEVEL, N_RESAMPLES, Estimate
 from armscan.tracking.sanitize import name_of
 from armscan.training import TRAINING, Evaluation, MetricEstimates, ResultTable
-from armscan.training.baselines import RANDOM
+from armscan.training.baselines import AGENT, RANDOM
 from armscan.training.episode_results import metric_prefix
 from armscan.training.headline import ABOVE_RANDOM, beside_random, headline
 from armscan.training.metric_display import interval_text
@@ -24,7 +24,6 @@ from armscan.training.metrics import LEAST_SURE, NOT_STARTED_SOLVED, SUREST
 from armscan.utils.text import MISSING, formatted
 
 TOTAL = "all volumes"
-AGENT = "agent"
 TIME = "mean_seconds_per_plane"
 # Metrics for which the table of results has no room.
 FURTHER_ROWS = (

@@ -13,7 +13,7 @@ from armscan.config.defaults import PHANTOM
 from armscan.config.error_messages import one_line_message
 from armscan.errors import InvalidValueError, few
 from armscan.evaluation.agent_source import EvaluatedAgent
-from armscan.tracking.tags import SUBJECTS, VOLUMES
+from armscan.tracking.tags import HOST_TAG, SUBJECTS, VOLUMES, WORKING_FOLDER_TAG
 from armscan.training import PARTS, TEST, TRAINING, VALIDATION, Split, check_unchanged
 from armscan.utils.files import check_writable, sha256
 from armscan.volumes import LabelVolume, load_phantoms, open_dataset
@@ -46,9 +46,12 @@ def own_split(source: EvaluatedAgent, parts: Sequence[str] = PARTS) -> Split:
         line = one_line_message(error)
         if run is None or line is None:
             raise
+        where, host = (
+            run.tags.get(WORKING_FOLDER_TAG, "a folder that was not kept"),
+            run.tags.get(HOST_TAG, "some host"),
+        )
         raise InvalidValueError(
-            f"the volumes of run {run.run_id} cannot be read: {line} (it was started in "
-            f"{run.tags.get('working_folder', 'a folder that was not kept')} on {run.tags.get('host', 'some host')})"
+            f"the volumes of run {run.run_id} cannot be read: {line} (it was started in {where} on {host})"
         ) from error
     if run is not None and source.volumes is not None:
         now = {part: prints for part, prints in split.fingerprints().items() if part in parts}

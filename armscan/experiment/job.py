@@ -19,6 +19,7 @@ from hydra.types import RunMode
 
 from armscan.config.command_hints import kept_command
 from armscan.config.defaults import CHOICES
+from armscan.config.sources import SWEEP
 from armscan.errors import FolderInUseError, FolderTakenError, InvalidValueError, reason_of
 from armscan.utils.files import atomic_write, sha256
 from armscan.utils.processes import ProcessInfo
@@ -194,10 +195,12 @@ def check_folder_stays(overrides: Sequence[str]) -> None:
 
 
 def check_choices(overrides: Sequence[str]) -> None:
-    """Raise `InvalidValueError` if a command line removes a configuration group or gives it a list, as Hydra allows."""
+    """Raise `InvalidValueError` if a command line adds a study, removes another group, or gives it a list."""
     for override in overrides:
         key, _, value = override.partition("=")
         group = key.lstrip("+~")
+        if (group == SWEEP and key != SWEEP) or group.startswith(f"{SWEEP}/"):
+            raise InvalidValueError(f"{override!r} is not allowed: a study is {SWEEP}=NAME")
         is_list = "[" in value and not value.startswith("glob(")
         if group in CHOICES and (key.startswith("~") or is_list):
             raise InvalidValueError(

@@ -22,7 +22,7 @@ from armscan.training import (
     evaluate,
     evaluate_baselines,
 )
-from armscan.training.baselines import RANDOM
+from armscan.training.baselines import AGENT, RANDOM
 from armscan.training.episode_results import TEST_METRICS, metric_prefix
 from armscan.training.episode_seeds import TEST_VOLUMES_SEED, TRAINING_VOLUMES_SEED
 from armscan.training.headline import ABOVE_RANDOM, MIN_SUBJECTS, beside_random, headline
@@ -32,7 +32,6 @@ from armscan.utils.run_files import BASELINES_FILE, EVALUATION_FILE, RESULTS_PAG
 from armscan.utils.text import PERCENT, counted, formatted
 
 LAST_VALIDATION, BEST_VALIDATION, NEW_EPISODES = "last validation", "best validation", "new validation episodes"
-AGENT = "agent"
 TITLES = {
     TEST: "agent, test",
     # Of the epoch that has the best one: see `docs/metrics.md`.

@@ -33,6 +33,9 @@ def print_grid_plan(arguments: Sequence[str]) -> None:
     with_its_folds = with_folds([each for each in arguments if each != PLAN])
     overrides = [each for each in with_its_folds if each not in MULTIRUN]
     parsed, jobs = jobs_of(overrides)
+    if len(overrides) == len(with_its_folds):
+        # The run without the option raises the same error.
+        compose(overrides)
     if len(jobs) == 1:
         raise InvalidValueError(
             f"{PLAN} is given, but this is a single run: it shows the jobs of a grid, and what a study searches "

@@ -19,7 +19,7 @@ from armscan.errors import TrackingError, few
 from armscan.experiment.console import print_result_table
 from armscan.experiment.job import INTERRUPTED, Grid, JobOutcome
 from armscan.experiment.results import TITLES, few_subjects
-from armscan.launch.folds_table import AGENT, ALL_FOLDS, folds_table
+from armscan.launch.folds_table import AGENT_ON_ALL_FOLDS, ALL_FOLDS, folds_table
 from armscan.launch.grid_jobs import jobs_of
 from armscan.reports.html import page
 from armscan.tracking.git import CODE_TAGS
@@ -146,7 +146,7 @@ def keep_folds_table(
     time_ms = now_ms()
     # If runs also differ in other settings, or folds are missing, only the page has their figures.
     groups = {
-        title: TEST_METRICS if title == AGENT else metric_prefix(title.removesuffix(ALL_FOLDS))
+        title: TEST_METRICS if title == AGENT_ON_ALL_FOLDS else metric_prefix(title.removesuffix(ALL_FOLDS))
         for title in table.results
         if title.endswith(ALL_FOLDS)
     }

@@ -127,7 +127,7 @@ class Multirun(Callback):
             WORKING_FOLDER_TAG: str(Path.cwd()),
             GRID_TAG: json.dumps(again),
         }
-        run = store.create_run(experiment_id, name=f"grid {command}"[:250], tags=tags)
+        run = store.create_run(experiment_id, name=f"grid {command}", tags=tags)
         if Multirun.repeats is not None:
             store.set_tag(Multirun.repeats, CONTINUED_TAG, run.info.run_id)
         was_resumed_with_trust = Multirun.repeats is not None and Multirun.is_trusted

@@ -56,5 +56,6 @@ def _mean_steps(training: TrackedTraining) -> float:
 
 def _figure(group: Group, training: TrackedTraining) -> str:
     name = html.escape(f"{group.title}: {training.label}")
-    contents = base64.b64encode(training.video or b"").decode()
+    assert training.video is not None, "only trainings with a video are chosen"
+    contents = base64.b64encode(training.video).decode()
     return f'<figure><img alt="an episode" data-video="{contents}"><figcaption>{name}</figcaption></figure>'

@@ -104,7 +104,7 @@ def differences(original: Original) -> list[str]:
     if modules := changed_modules(tags.get(OWN_CODE_TAG), original.setup.own_code):
         lines.append(f"the code of {few(modules)} has changed since")
     if RESUMED_TAG in tags:
-        lines.append(f"the run was cut off and resumed (times: {tags['resumed']}), which changes no figure by itself")
+        lines.append(f"the run was cut off and resumed (times: {tags[RESUMED_TAG]}), which changes no figure by itself")
     if original.environment is None:
         return [*lines, "the versions of its packages were not kept"]
     before, here = original.environment, environment()

@@ -20,6 +20,7 @@ from armscan.tracking import TrackingStore
 from armscan.tracking.outbox import ENDED
 from armscan.tracking.run import MAX_DEPTH
 from armscan.tracking.tags import PARENT_TAG
+from armscan.training.episode_results import TEST_METRICS
 
 # Attributes of a row by sort key.
 SORTS = {
@@ -115,17 +116,20 @@ class RunRow:
     @property
     def on_plane_rate(self) -> float | None:
         """On-plane rate on the test volumes, within its leading limits; None if it was not evaluated."""
-        return self.run.data.metrics.get(f"test_volumes/{self.on_plane.metric}")
+        return self._tested(self.on_plane.metric)
 
     @property
     def success_rate(self) -> float | None:
         """Success rate on the test volumes; None if it was not evaluated."""
-        return self.run.data.metrics.get("test_volumes/success_rate")
+        return self._tested("success_rate")
 
     @property
     def mean_steps(self) -> float | None:
         """Mean steps on the test volumes; None if it was not evaluated."""
-        return self.run.data.metrics.get("test_volumes/mean_steps")
+        return self._tested("mean_steps")
+
+    def _tested(self, metric: str) -> float | None:
+        return self.run.data.metrics.get(f"{TEST_METRICS}/{metric}")
 
     def expanded(self, depth: int = 0) -> Iterator[RunRow]:
         """Yield the row and those below it, each below its parent."""

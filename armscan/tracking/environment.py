@@ -39,8 +39,9 @@ def environment() -> Mapping[str, Any]:
     """Return the Python version, the machine and the packages of this process as plain values, read once."""
     # Skip packages vendored inside another one: Ray adds such a folder to the path when it is imported.
     folders = [folder for folder in sys.path if not PACKAGE_FOLDERS & {*Path(folder).parent.parts}]
-    found = map(_name_and_version, metadata.distributions(path=folders))
-    packages = {canonicalize_name(name): version for name, version in found if name}
+    found = [*map(_name_and_version, metadata.distributions(path=folders))]
+    # Of several versions on the path, Python imports the first.
+    packages = {canonicalize_name(name): version for name, version in reversed(found) if name}
     return {
         "python": platform.python_version(),
         "platform": platform.platform(),

@@ -37,6 +37,8 @@ SHORT = re.compile(
 OF_ARTIFACTS = ("list_artifacts", "download_artifacts", "log_artifact", "log_artifacts")
 # Tag of each run, by which a run is found again if the reply to its creation was lost.
 MADE_TAG = "made"
+# MLflow's column has no more; PostgreSQL refuses longer names.
+MAX_RUN_NAME_CHARS = 250
 
 
 class TrackingStore:
@@ -96,7 +98,7 @@ class TrackingStore:
         return get_artifact_repository(run.info.artifact_uri, tracking_uri=self.mlflow.tracking_uri)
 
     def create_run(self, experiment_id: str, *, name: str, tags: Mapping[str, str]) -> Run:
-        """Create exactly one run, even if the store becomes unavailable before it replies."""
+        """Create exactly one run, even if the store becomes unavailable before it replies; a long name is cut."""
         made, n_asked = uuid.uuid4().hex, 0
 
         def create() -> Run:
@@ -104,7 +106,8 @@ class TrackingStore:
             n_asked += 1
             if n_asked > 1 and (found := self.mlflow.search_runs([experiment_id], f"tags.{MADE_TAG} = '{made}'")):
                 return found[0]
-            return self.mlflow.create_run(experiment_id, run_name=name, tags={**tags_of(tags), MADE_TAG: made})
+            all_tags = {**tags_of(tags), MADE_TAG: made}
+            return self.mlflow.create_run(experiment_id, run_name=name[:MAX_RUN_NAME_CHARS], tags=all_tags)
 
         return self._asked(create)
 

@@ -19,7 +19,7 @@ from armscan.tracking.tags import DESCRIPTION_TAG
 from armscan.tracking.tracking_store import NOT_THERE, TrackingStore, reason_in, unavailable_reason
 from armscan.utils.files import sha256
 from armscan.utils.log import log
-from armscan.utils.retry import FIRST_PAUSE_S
+from armscan.utils.retry import pauses_s
 from armscan.utils.run_files import RESULTS_PAGE, VOLUMES_FILE
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ ENTRIES_AT_ONCE = 200
 DIGEST_CHARS = 16
 # SHA-256 of the description that armscan wrote: one with another checksum was written by a person.
 DESCRIPTION_SUM_TAG = "note.sha256"
-LONGEST_PAUSE_S, POLL_S = 5.0, 0.5
+POLL_S = 0.5
 
 
 class Uploader:
@@ -87,16 +87,15 @@ class Uploader:
         return "the store has not answered in time" if self._failure is None else reason_in(self._failure)
 
     def _work(self) -> None:
-        pause_s = FIRST_PAUSE_S
+        pauses = pauses_s()
         while not self._stopped.is_set():
             self._woken.clear()
             failure = self._failed()
             self._tell(failure)
             if failure is not None:
-                self._stopped.wait(pause_s)
-                pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
+                self._stopped.wait(next(pauses))
                 continue
-            pause_s = FIRST_PAUSE_S
+            pauses = pauses_s()
             with self._changing:
                 if not self._woken.is_set():
                     self._is_done.set()

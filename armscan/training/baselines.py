@@ -27,7 +27,7 @@ SOURCES = (
     *("agents/baselines.py", "agents/batch_agent.py", "training/episodes.py"),
     *("volumes/**/*.py", "anatomy/**/*.py", "envs/**/*.py"),
 )
-RANDOM = "random"
+AGENT, RANDOM = "agent", "random"
 
 
 def evaluate_baselines(

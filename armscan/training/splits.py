@@ -11,7 +11,7 @@ from armscan.training.subject_splits import PHANTOMS, parts_by_subject
 from armscan.utils.text import counted
 from armscan.utils.validation import check_choice, check_int, check_path
 from armscan.volumes import Dataset, LabelVolume, load_phantoms, open_dataset
-from armscan.volumes.dataset import SPLITS, copies_among
+from armscan.volumes.dataset import SPLITS, copies_among, first_volumes
 from armscan.volumes.phantom import VERSIONS
 from armscan.volumes.phantom.generate import PHANTOM_NAME
 from armscan.volumes.volume import palm_notes
@@ -228,9 +228,6 @@ def mixed_data(
     counts = {"training": n_training, "validation": n_validation, "test": n_test} | dict.fromkeys(wanted, 0)
     phantoms = _phantoms(counts, first_seed, cache_dir, version, may_be_none={"training", *wanted})
     dataset = open_dataset(check_path("data.path", path))
-    if n_volumes is not None:
-        check_int("data.n_volumes", n_volumes, at_least=1, at_most=len(dataset.volumes))
-    names = sorted(dataset.volumes)[:n_volumes]
-    dataset = replace(dataset, volumes={name: dataset.volumes[name] for name in names})
+    dataset = replace(dataset, volumes=first_volumes(dataset.volumes, n_volumes))
     parts = parts_by_subject(dataset, wanted, path, split_seed, folds, fold)
     return Split(**{part: volumes | phantoms[part] for part, volumes in _by_part(dataset, parts).items()})

@@ -109,12 +109,19 @@ def process_start(pid: int) -> str:
     """
     try:
         process = psutil.Process(pid)
-        # On Linux, the seconds since boot: psutil adds the boot time, which moves with the clock.
-        since_s = psutil.boot_time() if psutil.LINUX else 0.0
-        return "" if process.status() == psutil.STATUS_ZOMBIE else f"{process.create_time() - since_s:.2f}"
+        if process.status() == psutil.STATUS_ZOMBIE:
+            return ""
+        return f"{_seconds_from_boot_to_start(pid) if psutil.LINUX else process.create_time():.2f}"
     # Also if `pid` is not a process ID.
-    except (psutil.Error, TypeError, ValueError):
+    except (psutil.Error, OSError, TypeError, ValueError):
         return ""
+
+
+def _seconds_from_boot_to_start(pid: int) -> float:
+    """Return the start time of a process on Linux (proc(5)); psutil adds the boot time, which moves with the clock."""
+    # The name of the program, in brackets, may have spaces; the start is the 20th field after it.
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return int(fields[19]) / os.sysconf("SC_CLK_TCK")
 
 
 def _boot_and_pid_namespace() -> tuple[str, str]:

@@ -13,10 +13,17 @@ from armscan.utils.log import log
 
 T = TypeVar("T")
 RETRY_S = 600.0
-# The first pause between attempts, doubled after each one, and the longest.
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 5.0
 
 _this_thread = threading.local()
+
+
+def pauses_s() -> Iterator[float]:
+    """Yield the pauses between attempts in seconds: each is twice as long as the one before, up to the longest."""
+    pause_s = FIRST_PAUSE_S
+    while True:
+        yield pause_s
+        pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
 
 
 class RetryPolicy:
@@ -67,10 +74,9 @@ class RetryPolicy:
             return self._waited(operate, reason, cause)
 
     def _waited(self, operate: Callable[[], T], reason: str, cause: Exception) -> T:
-        until_s, pause_s = time.monotonic() + self._retry_s, FIRST_PAUSE_S
+        until_s, pauses = time.monotonic() + self._retry_s, pauses_s()
         while not self._is_over and time.monotonic() < until_s:
-            time.sleep(pause_s)
-            pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
+            time.sleep(next(pauses))
             try:
                 return operate()
             except Exception as error:

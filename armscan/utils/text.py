@@ -50,7 +50,12 @@ def looks_like_one_of(name: str, known: Iterable[str]) -> bool:
 def markdown_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Return a table in Markdown; its first column is aligned to the left, the others to the right."""
     lines = [columns, ["---", *("---:" for _ in columns[1:])], *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return "\n".join(f"| {' | '.join(map(_cell, line))} |" for line in lines)
+
+
+def _cell(text: str) -> str:
+    """Return the text of a cell of a Markdown table: a bar or a line break would end the cell."""
+    return " ".join(text.replace("|", r"\|").splitlines())
 
 
 def format_duration(seconds: float | None) -> str:

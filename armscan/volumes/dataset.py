@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from armscan.errors import ManifestError, VolumeError, few, listed
-from armscan.utils.validation import check_choice, check_path
+from armscan.utils.validation import check_choice, check_int, check_path
 from armscan.volumes.manifest import (
     MANIFEST_NAMES,
     SHARED_KEYS,
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 SPLITS = ("train", "validation", "test")
 Key = TypeVar("Key", bound=Hashable)
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -134,16 +135,32 @@ def subjects_in(path: str | Path, n_volumes: int | None = None) -> list[str]:
 
     Args:
         path: Folder of the volumes.
-        n_volumes: Number of volumes to include, the first by name. Default: None, all.
+        n_volumes: Number of volumes to include; see `first_volumes`. Default: None, all.
 
     Raises:
         VolumeError: If the folder cannot be read.
         ManifestError: If it has no manifest, or a damaged one.
+        InvalidValueError: If `n_volumes` is not allowed.
     """
     found, manifest, files = _manifest_of(path, require_manifest=True)
     entries = volume_entries(manifest, files, found)
     used = {name: entry.subject or name for name, entry in entries.items() if not entry.exclude}
-    return [used[name] for name in sorted(used)[:n_volumes]]
+    return [*first_volumes(used, n_volumes).values()]
+
+
+def first_volumes(volumes: Mapping[str, T], n_volumes: int | None) -> dict[str, T]:
+    """Return the first volumes by name.
+
+    Args:
+        volumes: Volumes, or what belongs to them, by file name.
+        n_volumes: Their number, `data.n_volumes` of the configuration; None: all.
+
+    Raises:
+        InvalidValueError: If `n_volumes` is not a whole number from 1 to the number of volumes.
+    """
+    if n_volumes is not None:
+        check_int("data.n_volumes", n_volumes, at_least=1, at_most=len(volumes))
+    return {name: volumes[name] for name in sorted(volumes)[:n_volumes]}
 
 
 def _split_of(splits: Splits, subjects: Mapping[str, str], used: Mapping[str, object], where: str) -> dict[str, str]:

@@ -24,6 +24,7 @@ LONGEST_SIDE_PX = 65536
 SMALLEST_SPACING_MM, MAX_SPACING_MM = 1e-6, 1e6
 # For dot products of direction cosines; files store these with six digits or more.
 RIGHT_ANGLE_TOLERANCE = 1e-3
+PALM_NOTE = "the palm is at low z{}, in phantoms at high z; orientation in the manifest flips axes"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -271,5 +272,4 @@ def _checked_direction(direction: FloatArray, name: str) -> FloatArray:
 def palm_notes(volumes: Mapping[str, LabelVolume]) -> list[str]:
     """Return a sentence on volumes, by name, whose palm is on the other side than in phantoms; reads all voxels."""
     turned = [name for name, volume in volumes.items() if not volume.has_palm_at_high_z]
-    advice = "in phantoms at high z; orientation in the manifest flips axes"
-    return [f"the palm is at low z in {few(turned)}, {advice}"] if turned else []
+    return [PALM_NOTE.format(f" in {few(turned)}")] if turned else []

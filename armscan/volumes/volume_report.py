@@ -15,7 +15,7 @@ from armscan.volumes.labelmap import (
     count_values,
 )
 from armscan.volumes.orientation import Crop, orientation_of
-from armscan.volumes.volume import LabelVolume
+from armscan.volumes.volume import PALM_NOTE, LabelVolume
 
 # Limits of the longest side of a volume of an arm.
 SMALLEST_MM, LARGEST_MM = 20.0, 2000.0
@@ -75,7 +75,7 @@ class VolumeReport:
         if not self.stored.has_directions:
             notes.append("the file states no directions of its axes (no qform and no sform); LPS is assumed")
         if not self.volume.has_palm_at_high_z:
-            notes.append("the palm is at low z, in phantoms at high z; orientation in the manifest flips axes")
+            notes.append(PALM_NOTE.format(""))
         return notes
 
     @property

@@ -15,7 +15,10 @@ from armscan.agents import (
     scheduled_algorithms,
 )
 from armscan.agents.batch_agent import BatchAgent
+from armscan.agents.plane_finder_learner import PlaneFinderLearner
+from armscan.agents.residual_learner import ResidualLearner
 from armscan.agents.schedule import read_schedule
+from armscan.agents.scheduled_learner import OPTIONAL
 from armscan.errors import InvalidValueError
 from tests.agents.conftest import ENV_FACTORIES, setup_for
 from tests.support.tensors import assert_same_tensors
@@ -62,6 +65,12 @@ def test_learner_with_a_schedule_has_the_notes_of_its_learner(make_scheduled):
     scheduled, learner = make_scheduled(), make_scheduled(is_scheduled=False)
     for note in ("update_note", "validation_note", "warm_up_note"):
         assert getattr(scheduled, note, None) == getattr(learner, note, None)
+
+
+def test_learner_with_a_schedule_has_every_optional_attribute_of_the_learners():
+    with_attributes = (PlaneFinderLearner, ResidualLearner)
+    of_learners = {name for learner in with_attributes for name in vars(learner) if not name.startswith("_")}
+    assert of_learners - set(dir(Learner)) - set(dir(BatchAgent)) <= set(OPTIONAL)
 
 
 def test_learner_with_a_schedule_says_which_changes_it_has_not_made(make_scheduled):

@@ -23,3 +23,13 @@ def test_message_from_a_part_of_the_network_names_its_keys(part):
     error = InstantiationException(f"Error in call to target\nfull_key: agent.network.{part}")
     error.__cause__ = InvalidValueError("network.filters is 0")
     assert one_line_message(error) == f"network.{part}.filters is 0"
+
+
+def test_error_from_another_process_and_without_a_traceback_is_no_mistake_of_the_user():
+    assert one_line_message(ValueError("x")) is None
+
+
+def test_text_that_is_no_configuration_is_not_called_one():
+    with pytest.raises(UnicodeDecodeError) as raised:
+        b"\xff".decode()
+    assert one_line_message(raised.value).startswith("a file cannot be read: 'utf-8' codec can't decode byte 0xff")

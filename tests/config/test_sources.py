@@ -94,3 +94,14 @@ def test_nothing_is_found_twice_in_the_checkout(monkeypatch, capsys):
     assert own_folders() == {}
     assert compose(["sweep=sac_y"]).study.name == "sac_y"
     assert capsys.readouterr().err == ""
+
+
+def test_study_in_a_subfolder_is_listed_as_it_is_chosen(working):
+    folder = working(sweeps__lab__mine=MINE)
+    (folder / "sweeps" / ".hidden.yaml").touch()
+    assert "lab/mine" in choices()["sweep"]
+    assert compose(["sweep=lab/mine"]).study.name == "mine"
+    with pytest.raises(MissingConfigException) as raised:
+        compose(["sweep=lab/other"])
+    assert "lab/mine" in raised.value.options
+    assert ".hidden" not in raised.value.options

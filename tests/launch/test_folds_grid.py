@@ -9,10 +9,10 @@ import pytest
 from hydra.errors import HydraException
 
 from armscan.config.error_messages import one_line_message
-from armscan.errors import InvalidValueError, VolumeError
+from armscan.errors import InvalidValueError, TrackingError, VolumeError
 from armscan.experiment.job import Grid, JobOutcome
 from armscan.launch.folds_grid import with_folds
-from armscan.launch.folds_table import AGENT, folds_table
+from armscan.launch.folds_table import AGENT_ON_ALL_FOLDS, folds_table
 from armscan.launch.grid_plan import print_grid_plan
 from armscan.launch.grid_tables import jobs_table, keep_folds_table, keep_tables
 from armscan.tracking.tags import DESCRIPTION_TAG
@@ -63,6 +63,7 @@ def test_plan_knows_which_choices_a_pattern_has(capsys):
     [
         (["seed=1", "--plan"], "--plan is given, but this is a single run: it shows the jobs of a grid"),
         (["-m", "agent=sac,nothing", "--plan"], "agent is 'nothing', but it must be"),
+        (["seed=0,1", "--plan"], "'seed=0,1' gives several values: armscan run -m tries each of them"),
     ],
 )
 def test_plan_of_what_is_no_grid_or_cannot_run_is_answered_in_one_line(words, line):
@@ -116,6 +117,9 @@ def test_impossible_folds_are_refused_before_anything_runs(folder):
         with_folds(["data=nifti", f"data.path={folder}", "data.folds=3"])
     with pytest.raises(VolumeError, match="nowhere"):
         with_folds(["data=nifti", "data.path=nowhere", "data.folds=2"])
+    for n_volumes in ("0", "4", "-1", "1.5", "abc", "[1]"):
+        with pytest.raises(InvalidValueError, match=r"data\.n_volumes is .* at least 1 and at most 3"):
+            with_folds(["data=mixed", f"data.path={folder}", "data.folds=2", f"data.n_volumes={n_volumes}"])
 
 
 def test_several_numbers_of_folds_are_refused(folder):
@@ -144,7 +148,7 @@ def test_table_puts_the_wrists_of_all_folds_together(tmp_path):
         for fold, distances in enumerate(of_folds)
     ]
     table = table_of(runs)
-    figures = table.results[AGENT]
+    figures = table.results[AGENT_ON_ALL_FOLDS]
     assert (figures.n_seeds, figures.n_volumes, figures.n_episodes) == (2, 2, 8)
     assert figures.estimate("median_distance_mm").value == 4.5
     # Whatever the seed of a training, random planes are the same: they count once.
@@ -153,7 +157,7 @@ def test_table_puts_the_wrists_of_all_folds_together(tmp_path):
     first = [json.loads((folder / "evaluation.json").read_text())[TEST] for folder, _ in runs[:2]]
     alone = Evaluation(tuple(each for one in first for each in Evaluation.of_dict(one).episodes))
     expected = MetricEstimates.of(alone).estimate("median_distance_mm")
-    found = table_of([(path, varied.split()[0]) for path, varied in runs[:2]]).results[AGENT]
+    found = table_of([(path, varied.split()[0]) for path, varied in runs[:2]]).results[AGENT_ON_ALL_FOLDS]
     assert found.estimate("median_distance_mm") == pytest.approx(expected)
 
 
@@ -163,7 +167,7 @@ def test_folds_that_a_seed_lacks_are_left_out_of_the_table(tmp_path):
         for fold, seed in ((0, 0), (0, 1), (1, 1))
     ]
     results = table_of(runs).results
-    assert (results[AGENT].n_seeds, results[AGENT].n_volumes) == (2, 1)
+    assert (results[AGENT_ON_ALL_FOLDS].n_seeds, results[AGENT_ON_ALL_FOLDS].n_volumes) == (2, 1)
     assert (results["random, all folds"].n_volumes, results["random, all folds"].n_episodes) == (1, 1)
     assert table_of([runs[0], runs[2]]) is None
     # A grid of three folds that was interrupted.
@@ -177,7 +181,7 @@ def test_every_wrist_counts_alike_however_many_a_fold_has(tmp_path):
     runs = [
         (left_by_a_run(tmp_path / name, name, each), f"data.fold={name}") for name, each in (("a", near), ("b", far))
     ]
-    figures = table_of(runs).results[AGENT]
+    figures = table_of(runs).results[AGENT_ON_ALL_FOLDS]
     assert (figures.n_volumes, figures.n_episodes) == (2, 4)
     assert figures.estimate("on_plane_5mm_10deg").value == 0.5
 
@@ -213,6 +217,15 @@ def test_folds_of_different_tasks_have_no_best(tmp_path, database, capsys, key, 
     said = capsys.readouterr()
     assert said.err == ""
     assert ("best of 2" in said.out) == (key == "agent")
+
+
+def test_damaged_evaluation_of_a_fold_is_an_error_in_one_line(tmp_path):
+    folder = left_by_a_run(tmp_path / "0", "wrist", [1.0])
+    file = folder / "evaluation.json"
+    for contents in (file.read_text()[:100], "{}", "[]", '{"test volumes": 3}'):
+        file.write_text(contents)
+        with pytest.raises(TrackingError, match=f"the evaluations in {folder} cannot be read: "):
+            folds_table([(folder, ["data.fold=0"])])
 
 
 @pytest.mark.parametrize("key", ["seed", "data.fold"])

@@ -2,6 +2,7 @@
 
 import json
 import platform
+from importlib import metadata
 
 import numpy as np
 import torch
@@ -32,3 +33,13 @@ def test_packages_in_the_folder_of_another_package_are_left_out(monkeypatch, tmp
     packages = environment.__wrapped__()["packages"]
     assert packages["alone"] == "1.0"
     assert "within" not in packages
+
+
+def test_of_several_versions_on_the_path_the_imported_one_counts(monkeypatch, tmp_path):
+    for version in ("1.0", "2.0"):
+        (tmp_path / version / f"twice-{version}.dist-info").mkdir(parents=True)
+        (tmp_path / version / f"twice-{version}.dist-info" / "METADATA").write_text(
+            f"Name: twice\nVersion: {version}\n"
+        )
+        monkeypatch.syspath_prepend(tmp_path / version)
+    assert environment.__wrapped__()["packages"]["twice"] == metadata.version("twice") == "2.0"

@@ -157,6 +157,11 @@ def test_metrics_of_volumes_of_any_name_reach_the_store(store, tmp_path):
     assert "test/volume/plain/mean_steps" in metrics
 
 
+def test_name_is_no_longer_than_every_database_takes(store):
+    client, experiment_id = store
+    assert client.create_run(experiment_id, name="n" * 300, tags={}).info.run_name == "n" * 250
+
+
 def test_description_of_a_person_stays_and_armscans_is_replaced(store):
     client, experiment_id = store
     run_id = client.create_run(experiment_id, name="n", tags={}).info.run_id

@@ -1,11 +1,21 @@
 """Processes that armscan starts."""
 
 import gc
+import itertools
 import os
 import subprocess
 import threading
 
-from armscan.utils.processes import child_command, n_usable_cores, no_garbage_collection, on_parent_exit
+import psutil
+import pytest
+
+from armscan.utils.processes import (
+    child_command,
+    n_usable_cores,
+    no_garbage_collection,
+    on_parent_exit,
+    process_start,
+)
 from tests.support import REPOSITORY
 
 
@@ -47,3 +57,16 @@ def test_cores_are_counted_where_there_is_no_affinity(monkeypatch):
     assert n_usable_cores() == len(os.sched_getaffinity(0))
     monkeypatch.delattr(os, "sched_getaffinity")
     assert n_usable_cores() == os.cpu_count()
+
+
+def test_start_of_a_process_does_not_move_with_the_clock(monkeypatch):
+    started = process_start(os.getpid())
+    assert float(started) > 0.0
+    # As after the clock was set, between any two calls.
+    monkeypatch.setattr(psutil, "boot_time", itertools.count(1.0).__next__)
+    assert process_start(os.getpid()) == started
+
+
+@pytest.mark.parametrize("pid", [2**22 + 1, -1, None, "1x"])
+def test_what_is_no_process_has_no_start(pid):
+    assert process_start(pid) == ""

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from armscan.utils.text import formatted
+from armscan.utils.text import formatted, markdown_table
 
 
 @pytest.mark.parametrize(
@@ -25,3 +25,10 @@ from armscan.utils.text import formatted
 )
 def test_rate_is_not_rounded_to_none_or_all_and_a_rounded_0_has_no_sign(form, value, text):
     assert formatted(form, value) == text
+
+
+def test_no_cell_of_a_table_ends_early():
+    assert (
+        markdown_table(["a", "b"], [["wrist|1", "two\nlines"]])
+        == "| a | b |\n| --- | ---: |\n| wrist\\|1 | two lines |"
+    )

@@ -179,14 +179,15 @@ def _videos(final_trials: Sequence[FrozenTrial]) -> str:
     """Return one video of each configuration on the test volumes, from its first training with a video here."""
     videos: dict[int, str] = {}
     for trial in final_trials:
-        files = [each / VIDEO_FILE for each in seed_folders(Path(trial.user_attrs.get(FOLDER, "nowhere")))]
-        # An untrusted folder may have links to any file of this user.
-        files = [file for file in files if file.is_file() and file.read_bytes().startswith(GIF)]
         number = trial.user_attrs[FINALIST]
-        if files and number not in videos:
-            address = video_address(files[0].read_bytes())
+        if number in videos:
+            continue
+        files = [each / VIDEO_FILE for each in seed_folders(Path(trial.user_attrs.get(FOLDER, "nowhere")))]
+        read = (file.read_bytes() for file in files if file.is_file())
+        # An untrusted folder may have links to any file of this user.
+        if (video := next((each for each in read if each.startswith(GIF)), None)) is not None:
             caption = f"<figcaption>{name_of(number)}</figcaption>"
-            videos[number] = f'<figure><img alt="an episode" src="{address}">{caption}</figure>'
+            videos[number] = f'<figure><img alt="an episode" src="{video_address(video)}">{caption}</figure>'
     # Trainings without episodes have no videos.
     if not videos and not any(EPISODES in trial.system_attrs for trial in final_trials):
         return ""

@@ -201,7 +201,10 @@ def _values(parameter: Parameter) -> str:
     drawn: Any = parameter.distribution
     if isinstance(drawn, CategoricalDistribution):
         return ", ".join(map(str, drawn.choices))
-    how = ", whole" if isinstance(drawn, IntDistribution) else ""
+    is_whole = isinstance(drawn, IntDistribution)
+    # `g` would round large integers.
+    form = "d" if is_whole else "g"
+    how = ", whole" if is_whole else ""
     how += ", log" if drawn.log else ""
-    how += f", in steps of {drawn.step:g}" if drawn.step not in (None, 1) else ""
-    return f"{drawn.low:g} to {drawn.high:g}{how}"
+    how += f", in steps of {drawn.step:{form}}" if drawn.step is not None and not (is_whole and drawn.step == 1) else ""
+    return f"{drawn.low:{form}} to {drawn.high:{form}}{how}"

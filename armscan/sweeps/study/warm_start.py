@@ -34,6 +34,7 @@ from armscan.sweeps.storage.attribute_names import (
 from armscan.sweeps.storage.attributes import FINAL_SUFFIXES, check_trials
 from armscan.sweeps.storage.reports import REPORT
 from armscan.sweeps.storage.storage import Storage, existing_storage
+from armscan.sweeps.study.arguments import SEARCH_PATH
 from armscan.sweeps.study.fixed_config import comparable_settings, config_changes, differing, fixed_of
 from armscan.sweeps.study.settings import OPTUNA_PRUNERS, StudySettings
 from armscan.sweeps.study.study import best_trials, is_ours
@@ -42,7 +43,7 @@ from armscan.utils.text import counted
 PRESET, SOURCE = "preset {}", "study {}"
 # Number of best settings that are tried first, of a study with another configuration.
 N_ENQUEUED = 10
-# It would prune most trials that follow good ones (docs/sweep-bench.md#warm-start).
+# It would prune most trials that follow good ones (docs/sweep-bench-search.md#warm-start).
 MEDIAN_PRUNER = f"{OPTUNA_PRUNERS}MedianPruner"
 # In `study.enqueue`: the configuration of the study itself.
 DEFAULT = "default"
@@ -116,7 +117,9 @@ def initial_trials(
 
 
 def _of_preset(space: Space, name: str, overrides: Sequence[str]) -> InitialTrials:
-    chosen, misfit = values_of(space, overrides if name == DEFAULT else [f"experiment={name}"])
+    # The preset may be in a folder of the search path.
+    of_preset = [*(each for each in overrides if each.startswith(SEARCH_PATH)), f"experiment={name}"]
+    chosen, misfit = values_of(space, overrides if name == DEFAULT else of_preset)
     if misfit:
         return InitialTrials(PRESET.format(name), f"preset {name} is not tried: {misfit}")
     message = f"of preset {name}, the searched values are tried first: {' '.join(overrides_of(chosen))}"

@@ -47,7 +47,7 @@ def _draw_ranks(axes: Axes, ranks: pd.DataFrame) -> None:
     for place, pruner in enumerate(PRUNERS):
         is_drawn = (ranks.pruner == pruner).to_numpy()
         rows = ranks[is_drawn]
-        heights = [order.index(name) + 0.2 * (1 - place) for name in np.array(names)[is_drawn]]
+        heights = [order.index(name) + 0.2 * ((len(PRUNERS) - 1) / 2 - place) for name in np.array(names)[is_drawn]]
         ends = np.abs(rows[["low", "high"]].to_numpy().T - rows.regret.to_numpy())
         axes.errorbar(rows.regret, heights, xerr=ends, fmt="o", capsize=2, label=f"pruner {pruner}")
     axes.set_yticks(range(len(order)), order)
@@ -55,7 +55,7 @@ def _draw_ranks(axes: Axes, ranks: pd.DataFrame) -> None:
     axes.set_xlim(left=0)
     axes.set_title("what a study chooses, by sampler and pruner")
     axes.grid(alpha=0.3)
-    axes.legend(ncols=3, fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.16))
+    axes.legend(ncols=2, fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.16))
 
 
 def _draw_races(axes: Axes, fixed: Sequence[Choices], races: Mapping[str, Choices], *, title: str) -> None:

@@ -18,7 +18,7 @@ from benchmarks.sweeps.bench.replay import DEFAULT, Rule, choose, scores_of, sea
 from benchmarks.sweeps.bench.seed_rules import MAX_SEEDS, fixed
 from benchmarks.sweeps.bench.surrogate import SimulatedConfig, Surrogate
 
-SAMPLERS, PRUNERS = ("random", "tpe", "cmaes", "nsga2"), ("none", "median", "halving")
+SAMPLERS, PRUNERS = ("random", "tpe", "cmaes", "nsga2"), ("none", "median", "percentile", "halving")
 # Samplers that are also compared with two seeds a trial.
 TWO_SEEDS = ("random", "tpe")
 # The rule that all are compared with.

@@ -229,6 +229,15 @@ def test_preset_whose_values_lie_in_the_space_is_tried_first():
     )
 
 
+def test_preset_may_be_in_a_folder_of_the_search_path(tmp_path):
+    (tmp_path / "experiment").mkdir()
+    (tmp_path / "experiment" / "ours.yaml").write_text("# @package _global_\nagent: {lr: 0.002}\n")
+    words = ["sweep=sac_y", f"hydra.searchpath=[file://{tmp_path}]", "study.enqueue=[ours]"]
+    asked, _, config = read_settings(words)
+    (ours,) = initial_trials(asked, words, to_plain(config), None)
+    assert ours.enqueued[0]["agent.lr"] == 0.002
+
+
 def test_taken_trial_with_the_values_of_the_control_is_no_candidate_beside_it(study_in):
     space, words = {"agent.lr": LR, "stack": STACK}, ["sweep=sac_y", "agent.lr=2e-3"]
     control, misfit = values_of(Space.read(space), words)
