@@ -86,8 +86,8 @@ class ArmscanEnv(gym.Env[Observed, FloatArray]):
             planes of these volumes. Default: None, the published reward.
         targets: Target counts of the published reward: clusters of bones, tendons and artery, each from 1 to 1000; not
             with another `reward`. Default: (4, 3, 1).
-        clustering: Clustering rules: `pixels`, as published; `metric`, for every spacing; or an
-            `armscan.anatomy.Tissues`. Default: `pixels`.
+        clustering: Clustering rules: `pixels`, as published; `metric`, in mm, for pixels of up to 0.6 mm;
+            or an `armscan.anatomy.Tissues`. Default: `pixels`.
         success_threshold: Threshold of success, in (0, 1]: a plane whose reward is above -success_threshold succeeds.
             Default: 0.05.
         ends: Event that ends an episode before `max_steps`: `on_reward`, the first success; `on_budget`, none;
