@@ -87,20 +87,24 @@ def evaluate_and_track(
             tracked.log_metrics(named, n_env_steps=source.n_env_steps)
         own = FOLDER / f"{file_name(source.name, data, tracked.run_id[:ID_CHARS])}{SUFFIX}"
         file = out or own
-        text = json.dumps(report.to_dict(), indent=1, allow_nan=False)
-        atomic_write(file, text, follow_link=True)
-        shown = own.with_suffix(".html")
-        notes = [*notes_on_rules(source), *prepared.notes]
-        sections, described = [], [f"Note: {note}." for note in notes]
-        for label, table in report.tables().items():
-            of_label = [f"Note: {note}." for note in notes_on(prepared, report, label)]
-            paragraphs = "".join(f"<p>{html.escape(note)}</p>" for note in of_label)
-            sections.append(f"<h2>{html.escape(label)}</h2>{table.html()}{paragraphs}")
-            described += [f"### {label}", table.markdown(), *of_label]
-        atomic_write(shown, page(tracked.name, "".join(sections), notes=notes))
-        tracked.set_description("\n\n".join(described))
-        tracked.log_files(file, shown)
+        atomic_write(file, json.dumps(report.to_dict(), indent=1, allow_nan=False), follow_link=True)
+        description, shown = _described(prepared, report, tracked.name)
+        atomic_write(own.with_suffix(".html"), shown)
+        tracked.set_description(description)
+        tracked.log_files(file, own.with_suffix(".html"))
     return report, file
+
+
+def _described(prepared: PreparedAgent, report: EvaluationReport, title: str) -> tuple[str, str]:
+    """Return the tables of an evaluation with their notes, as Markdown and as an HTML page."""
+    notes = [*notes_on_rules(prepared.source), *prepared.notes]
+    sections, described = [], [f"Note: {note}." for note in notes]
+    for label, table in report.tables().items():
+        of_label = [f"Note: {note}." for note in notes_on(prepared, report, label)]
+        paragraphs = "".join(f"<p>{html.escape(note)}</p>" for note in of_label)
+        sections.append(f"<h2>{html.escape(label)}</h2>{table.html()}{paragraphs}")
+        described += [f"### {label}", table.markdown(), *of_label]
+    return "\n\n".join(described), page(title, "".join(sections), notes=notes)
 
 
 def notes_on(prepared: PreparedAgent, report: EvaluationReport, label: str) -> list[str]:

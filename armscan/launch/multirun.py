@@ -113,23 +113,8 @@ class Multirun(Callback):
         # Ends what dead processes have left running, such as the grid that is repeated.
         upload_pending(store)
         (folder / OUTCOME_FOLDER).mkdir(parents=True)
-        command = " ".join(overrides)
-        # Includes the tracking URI, because the environment may differ later.
-        hydra_overrides = [each for each in config.hydra.overrides.hydra if not each.startswith(NOT_REPEATED)]
-        again = [
-            *overrides,
-            *hydra_overrides,
-            f"{TRACKING_URI}={QuotedString(tracking['uri'], Quote.single).with_quotes()}",
-        ]
-        tags = {
-            **code_state().tags,
-            OVERRIDES_TAG: command,
-            WORKING_FOLDER_TAG: str(Path.cwd()),
-            GRID_TAG: json.dumps(again),
-        }
-        run = store.create_run(experiment_id, name=f"grid {command}", tags=tags)
-        if Multirun.repeats is not None:
-            store.set_tag(Multirun.repeats, CONTINUED_TAG, run.info.run_id)
+        again = _repeating(config, tracking["uri"])
+        run = _parent_run(store, experiment_id, overrides, again)
         was_resumed_with_trust = Multirun.repeats is not None and Multirun.is_trusted
         grid = Grid(
             run_id=run.info.run_id,
@@ -150,6 +135,28 @@ class Multirun(Callback):
             store.delete_run(run.info.run_id)
             raise
         Multirun.folder, Multirun.grid, Multirun.launcher = folder, grid, launcher
+
+
+def _repeating(config: DictConfig, uri: str) -> list[str]:
+    """Return the overrides that repeat a grid: its own, and the tracking URI, because the environment may differ."""
+    hydra_overrides = [each for each in config.hydra.overrides.hydra if not each.startswith(NOT_REPEATED)]
+    tracking = f"{TRACKING_URI}={QuotedString(uri, Quote.single).with_quotes()}"
+    return [*config.hydra.overrides.task, *hydra_overrides, tracking]
+
+
+def _parent_run(store: TrackingStore, experiment_id: str, overrides: Sequence[str], again: Sequence[str]) -> Run:
+    """Create the parent run of a grid, and note it in the run of the grid that it repeats."""
+    command = " ".join(overrides)
+    tags = {
+        **code_state().tags,
+        OVERRIDES_TAG: command,
+        WORKING_FOLDER_TAG: str(Path.cwd()),
+        GRID_TAG: json.dumps(again),
+    }
+    run = store.create_run(experiment_id, name=f"grid {command}", tags=tags)
+    if Multirun.repeats is not None:
+        store.set_tag(Multirun.repeats, CONTINUED_TAG, run.info.run_id)
+    return run
 
 
 def _check_not_continued(store: TrackingStore, experiment_id: str, run_id: str) -> None:

@@ -114,6 +114,12 @@ def check_metaimage(path: Path) -> None:
     if missing := [name for name in METAIMAGE_FIELDS if name not in fields]:
         raise VolumeError(f"{path}: the header gives no {missing[0]}, but a MetaImage needs it")
     _check_n_numbers(path, fields)
+    _check_places(path, fields)
+    check_stored(path, _stored_metaimage(path, fields, header))
+
+
+def _check_places(path: Path, fields: Mapping[str, str]) -> None:
+    """Check the fields of a MetaImage that say where its voxels lie."""
     spacing = fields.get("ElementSpacing", fields.get("ElementSize"))
     if spacing is None:
         raise VolumeError(f"{path}: the file gives no spacing (ElementSpacing), but a volume needs one")
@@ -125,6 +131,10 @@ def check_metaimage(path: Path) -> None:
         stated = {name: [_number(word) for word in fields[name].split()] for name in names if name in fields}
         if any(numbers != next(iter(stated.values())) for numbers in stated.values()):
             raise VolumeError(f"{path}: {listed(stated)} differ, but only one of them is used: remove the wrong one")
+
+
+def _stored_metaimage(path: Path, fields: Mapping[str, str], header: bytes) -> StoredVoxels:
+    """Check the fields of a MetaImage that say how its voxels are stored, and return where they are."""
     sizes = [_whole(path, "DimSize", word) for word in fields["DimSize"].split()]
     kind = fields["ElementType"]
     if kind not in METAIMAGE_TYPES or fields["NDims"] != str(len(sizes)):
@@ -149,13 +159,12 @@ def check_metaimage(path: Path) -> None:
         )
     if (n_values := fields.get("ElementNumberOfChannels", "1")) != "1":
         raise VolumeError(f"{path}: ElementNumberOfChannels is {n_values}, but a labelmap has one value per voxel")
-    stored = StoredVoxels(
+    return StoredVoxels(
         file,
         count_voxels(path, sizes) * METAIMAGE_TYPES[kind],
         offset=offset,
         compression=GZIP_OR_ZLIB if is_compressed else None,
     )
-    check_stored(path, stored)
 
 
 # By suffix; the first one that a file name ends with applies.
@@ -197,7 +206,7 @@ def _check_n_numbers(path: Path, fields: Mapping[str, str]) -> None:
             raise VolumeError(f"{path}: {name} is {fields[name]!r}, but it must be {count} numbers")
 
 
-def _check_nrrd_spacing(path: Path, fields: dict[str, str]) -> None:
+def _check_nrrd_spacing(path: Path, fields: Mapping[str, str]) -> None:
     if "spacings" in fields:
         check_spacing(path, [_number(word) for word in fields["spacings"].split()])
     elif "space directions" in fields:
@@ -239,7 +248,7 @@ def _no_labelmap(path: Path, dimension: str, sizes: list[int], kind: str) -> str
     return f"{path}: has {received}, but a labelmap has 3, a size for each, and integers or floats"
 
 
-def _is_true(path: Path, fields: dict[str, str], name: str, *, default: bool) -> bool:
+def _is_true(path: Path, fields: Mapping[str, str], name: str, *, default: bool) -> bool:
     value = fields.get(name, str(default))
     if value.lower() not in ("true", "false"):
         raise VolumeError(f"{path}: {name} is {value!r}, but it must be True or False")
