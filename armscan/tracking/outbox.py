@@ -112,6 +112,11 @@ class OutboxFile:
         return entries, end
 
     @property
+    def is_removed(self) -> bool:
+        """Whether the file was removed, with the run's folder or alone."""
+        return not self.file.exists()
+
+    @property
     def is_uploaded(self) -> bool:
         """Whether everything is uploaded."""
         return all(not self.next_entries(channel, 1)[0] for channel in CHANNELS)

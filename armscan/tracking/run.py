@@ -283,6 +283,9 @@ class TrackedRun:
 
         Returns:
             Whether everything is uploaded; the rest stays in the run's folder.
+
+        Raises:
+            TrackingError: If a finished run's folder was removed before everything was uploaded; the run has failed.
         """
         if self._is_closed:
             return self._is_uploaded
@@ -298,11 +301,22 @@ class TrackedRun:
         if self._is_uploaded:
             forget(self.run_id)
         self._outbox.close()
-        if failure is not None:
+        if failure is not None and self._outbox.is_removed:
+            self._fail_without_folder(status)
+        elif failure is not None:
             again = armscan_command("runs", "sync", str(self._outbox.folder))
             how = "uploads the rest" if self._uploader.is_unavailable else "uploads the rest once the store takes it"
             log(f"run {self.run_id}: {self._store.uri} did not receive everything ({failure}): {again} {how}")
         return self._is_uploaded
+
+    def _fail_without_folder(self, status: str) -> None:
+        """Mark the run as failed in its store, because what was not uploaded is lost."""
+        reason = f"its folder {self._outbox.folder} was removed before everything was uploaded"
+        self._store.set_tag(self.run_id, FAILURE_TAG, reason[:MAX_REASON_CHARS])
+        self._store.set_terminated(self.run_id, "FAILED")
+        forget(self.run_id)
+        if status == "FINISHED":
+            raise TrackingError(f"run {self.run_id} has failed: {reason}")
 
     def _add(self, **entry: Any) -> None:
         self._outbox.add(**entry)

@@ -109,13 +109,16 @@ class Uploader:
                 upload(self._outbox, self._store.mlflow, channel)
             # Any error of the store: the entries stay in the outbox, and the training goes on.
             except Exception as error:
-                failure = error
+                failure = TrackingError("the run's folder was removed") if self._outbox.is_removed else error
         return failure
 
     def _tell(self, failure: Exception | None) -> None:
         """Log once that the store is unavailable or refuses entries, and once that it is back."""
         before, self._failure = self._failure, failure
-        if failure is not None and before is None:
+        if failure is not None and self._outbox.is_removed:
+            if before is None:
+                log(f"{self._outbox.folder} was removed: what is not uploaded yet is lost")
+        elif failure is not None and before is None:
             is_unavailable = unavailable_reason(failure) is not None
             said = "cannot be reached or written to" if is_unavailable else "refuses entries"
             log(f"{self._store.uri} {said} ({reason_in(failure)}): entries are buffered in {self._outbox.file}")

@@ -5,6 +5,7 @@ import dataclasses
 import functools
 import json
 import math
+import shutil
 import sqlite3
 import subprocess
 import sys
@@ -210,6 +211,22 @@ def test_folder_that_was_removed_before_it_was_uploaded_is_told(store, tmp_path,
     said = capsys.readouterr().out
     assert "policy/MLmodel was removed before the store could keep it" in said
     assert "best.pt was removed" in said
+
+
+@pytest.mark.parametrize("status", ["FINISHED", "KILLED"])
+def test_run_whose_folder_was_removed_fails_at_once(store, tmp_path, capsys, status):
+    client, experiment_id = store
+    folder = tmp_path / "run"
+    tracked = TrackedRun.start(client, experiment_id, name="n", config={}, tags={}, folder=folder)
+    shutil.rmtree(folder)
+    refused = pytest.raises(TrackingError, match=r"its folder .* was removed")
+    with refused if status == "FINISHED" else contextlib.nullcontext():
+        # It would wait for a store that is unavailable.
+        tracked.end(status, wait_s=60.0)
+    run = client.get_run(tracked.run_id)
+    assert run.info.status == "FAILED"
+    assert "was removed before everything was uploaded" in run.data.tags["failure"]
+    assert "unavailable" not in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("kind", ["above", "absolute", "link"])
