@@ -73,8 +73,8 @@ class PlaneGrid:
         n_steps = np.maximum(1.0, np.round((highest - lowest) / steps))
         if np.prod(n_steps + 1) > MAX_PLANES:
             raise InvalidValueError(
-                f"the search would score {np.prod(n_steps + 1):.3g} planes, but at most {MAX_PLANES} are allowed: take "
-                "larger steps or smaller angles"
+                f"the search would score {np.prod(n_steps + 1):.3g} planes, but at most {MAX_PLANES} are allowed: is "
+                "the spacing of the volume in mm? In Python, take larger steps or smaller angles"
             )
         n_rz, n_rx, n_along = (int(n) + 1 for n in n_steps)
         return cls(lowest, (highest - lowest) / n_steps, (n_rz, n_rx, n_along))

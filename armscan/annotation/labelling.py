@@ -87,7 +87,7 @@ def label(options: LabellingOptions) -> tuple[list[tuple[LabelVolume, FoundPlane
             plane = find(volume)
         # InvalidValueError: the clustering rules, or the agent, do not suit the volume.
         except (OptimalPlaneError, InvalidValueError) as error:
-            failures.append(error)
+            failures.append(error if name in str(error) else InvalidValueError(f"{name}: {error}"))
             continue
         # The manifest last: no plane is written into it without a picture.
         _make_folder(options.pictures)

@@ -22,6 +22,8 @@ from armscan.errors import ArmscanError, in_one_line, listed, print_error
 from armscan.utils.files import FULL_DISK
 
 TRACEBACKS = "ARMSCAN_TRACEBACKS"
+# Characters of lists, dictionaries, functions and quoted strings in Hydra's overrides.
+PARTS_OF_VALUES = frozenset("[]{}()'\"")
 # Modules that read configurations, and Python's own that decode text.
 OF_CONFIGURATION, DECODING = ("hydra.", "omegaconf.", "yaml."), ("codecs", "encodings.utf_8")
 # Keys of a folder of volumes, which phantoms do not have.
@@ -53,9 +55,10 @@ def one_line_message(error: BaseException) -> str | None:
             return f"{several[1]!r} gives several values: armscan run -m tries each of them; a list is KEY=[A,B]"
         case OverrideParseException():
             if given := re.fullmatch(r"([+~]*[\w./@:-]+)=(.*)", str(error.override), re.DOTALL):
-                return (
-                    f"the value of {given[1]} cannot be read: {given[2]}; quote strings in it: {given[1]}=\"['a b']\""
-                )
+                key, value = given.groups()
+                has_parts = not PARTS_OF_VALUES.isdisjoint(value)
+                advice = f"quote strings in it: {key}=\"['a b']\"" if has_parts else f"quote it: {key}=\"'{value}'\""
+                return f"the value of {key} cannot be read: {value}; {advice}"
             return f"{error.override!r} cannot be read: what follows the options must be key=value"
         case MissingMandatoryValue():
             return f"{error.full_key} is not set, but it must be: give {error.full_key}=VALUE"

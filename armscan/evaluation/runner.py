@@ -33,6 +33,7 @@ from armscan.training.episode_results import Env
 from armscan.training.episode_seeds import EVALUATION_SEED
 from armscan.utils.console import print_sentence
 from armscan.utils.text import counted
+from armscan.volumes.dataset import check_copies
 from armscan.volumes.volume import palm_notes
 
 PIXEL_TOLERANCE = 0.1
@@ -113,6 +114,8 @@ def prepare_agent(
     parts = ("training",) if data else PARTS
     own = cache(partial(own_split, source, parts))
     groups = volume_groups(data, n_phantoms, own, phantom_version(source))
+    for volumes in groups.values():
+        check_copies(volumes)
     check(groups)
     prepared = prepare_on_volumes(source, groups, own, render_mode=render_mode)
     notes = list(prepared.notes)

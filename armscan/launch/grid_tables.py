@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import html
 import math
 import shlex
@@ -11,11 +12,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from armscan.config.defaults import FOLD
+from armscan.config.defaults import FOLD, FOLDS
 from armscan.config.error_messages import one_line_message
 from armscan.config.own_code import mixed_modules
-from armscan.config.task import have_same_task
-from armscan.errors import TrackingError, few
+from armscan.config.task import task_differences
+from armscan.errors import ArmscanError, TrackingError, few
 from armscan.experiment.console import print_result_table
 from armscan.experiment.job import INTERRUPTED, Grid, JobOutcome
 from armscan.experiment.results import TITLES, few_subjects
@@ -34,6 +35,10 @@ from armscan.training.result_table import with_baselines
 from armscan.utils.files import atomic_write
 from armscan.utils.run_files import ID_CHARS, RESULTS_PAGE
 from armscan.utils.text import MISSING, counted
+from armscan.volumes.dataset import subjects_in
+
+# Parameters by which tasks differ that a note names.
+N_NAMED = 3
 
 if TYPE_CHECKING:
     from mlflow.entities import Run
@@ -107,6 +112,10 @@ def keep_tables(
         on_code = [f"the jobs used different versions of {few(mixed)} (tag {OWN_CODE_TAG})"] if mixed else []
         if len({tuple(run.data.tags.get(tag) for tag in CODE_TAGS) for run in finished}) > 1:
             on_code.append(f"the jobs used different versions of armscan's code (tags {', '.join(CODE_TAGS)})")
+        if others := _task_differences(finished):
+            on_code.append(
+                f"the jobs have different tasks ({few(others, N_NAMED)}), so the table names none as the best"
+            )
         if planned is not None and (pooled := _pooled_folds(grid, outcomes, finished, planned)) is not None:
             of_folds, notes = pooled[0], [*pooled[1], *on_code]
             print_result_table(f"{next(iter(of_folds.results)).split(', ')[1]} (test)", of_folds, notes)
@@ -167,6 +176,23 @@ def _keep_page(folder: Path, text: str, description: str, store: TrackingStore, 
     set_description(store, run_id, description)
 
 
+def _task_differences(runs: Sequence[Run]) -> list[str]:
+    """Return the parameters by which the tasks of jobs differ, beside their folds."""
+    return task_differences({key: value for key, value in run.data.params.items() if key != FOLD} for run in runs)
+
+
+def _n_folds(finished: Sequence[Run], n_planned: int) -> int:
+    """Return the number of folds of a cross-validation, of which a grid may have planned some alone."""
+    params = finished[0].data.params if finished else {}
+    folds, n_volumes = params.get(FOLDS, ""), params.get("data.n_volumes", "")
+    if folds.isdecimal():
+        return int(folds)
+    # The folder of the volumes may be gone, or have changed.
+    with contextlib.suppress(ArmscanError, KeyError):
+        return len(set(subjects_in(params["data.path"], int(n_volumes) if n_volumes.isdecimal() else None)))
+    return n_planned
+
+
 def _pooled_folds(
     grid: Grid,
     outcomes: Mapping[str, JobOutcome],
@@ -182,10 +208,10 @@ def _pooled_folds(
         for number, outcome in outcomes.items()
     }
     tested = [(Path(run.data.tags[FOLDER_TAG]), varied[run.data.tags[JOB_TAG]]) for run in finished]
-    table = folds_table(tested, len({job[FOLD] for job in planned}))
+    table = folds_table(tested, _n_folds(finished, len({job[FOLD] for job in planned})))
     if table is None:
         return None
-    if not have_same_task({key: value for key, value in run.data.params.items() if key != FOLD} for run in finished):
+    if _task_differences(finished):
         # The best of them would be the easiest.
         table = replace(table, headline="")
     left_out = len(planned) - len(finished)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import shutil
 import tempfile
 import threading
@@ -121,6 +123,8 @@ def make_model(agent: Learner, env: Env, folder: Path, facts: Mapping[str, Any])
     except Exception as error:
         if isinstance(error, ExportError) or is_interruption(error):
             raise
+        if f"[Errno {errno.ENOSPC}]" in str(error):
+            raise ExportError(f"{folder}: the model cannot be written ({os.strerror(errno.ENOSPC)})") from error
         raise ExportError(f"the model cannot be written or run: {reason_in(error)}") from error
 
 

@@ -35,6 +35,8 @@ MEANS = {
     "mean_distance_deg": "distance_deg",
     "mean_dice": "mean_dice",
 }
+# Prefixes of metrics that depend on the last plane alone.
+OF_LAST_PLANE = ("on_plane_", "mean_distance_", "median_distance_", "mean_dice")
 
 Env = gym.Env[Observed, FloatArray]
 

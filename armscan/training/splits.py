@@ -11,7 +11,7 @@ from armscan.training.subject_splits import PHANTOMS, parts_by_subject
 from armscan.utils.text import counted
 from armscan.utils.validation import check_choice, check_int, check_path
 from armscan.volumes import Dataset, LabelVolume, load_phantoms, open_dataset
-from armscan.volumes.dataset import SPLITS, copies_among, first_volumes
+from armscan.volumes.dataset import SPLITS, check_copies, copies_among, first_volumes
 from armscan.volumes.phantom import VERSIONS
 from armscan.volumes.phantom.generate import PHANTOM_NAME
 from armscan.volumes.volume import palm_notes
@@ -37,6 +37,7 @@ class Split:
 
     Raises:
         InvalidValueError: If one of the three has no volume, or two have the same volume, or copies of it.
+        VolumeError: If two volumes of different subjects have the same voxels.
     """
 
     training: dict[str, LabelVolume]
@@ -69,6 +70,8 @@ class Split:
                     f"{name} ({part}) is a copy of {other} ({its_part}), but a wrist must be in one part: "
                     "give both the same subject in the manifest, or remove one"
                 )
+        for volumes in self.parts.values():
+            check_copies(volumes)
 
     @property
     def parts(self) -> dict[str, dict[str, LabelVolume]]:

@@ -194,6 +194,16 @@ def _manifest_of(path: str | Path, *, require_manifest: bool) -> tuple[Path | No
     return None, Manifest(), files
 
 
+def check_copies(volumes: Mapping[str, LabelVolume]) -> None:
+    """Raise `VolumeError` if two volumes of different subjects have the same voxels: a wrist would count twice."""
+    for other, name in copies_among(volumes):
+        if (volumes[other].subject or other) != (volumes[name].subject or name):
+            raise VolumeError(
+                f"{name} is a copy of {other}, but has another subject: give both the same subject in the manifest, or "
+                "remove one"
+            )
+
+
 def copies_among(volumes: Mapping[Key, LabelVolume]) -> Iterator[tuple[Key, Key]]:
     """Yield the keys of each pair of volumes with the same voxels; their labelled planes may differ."""
     # Only volumes with the same sample of voxels are compared in full.

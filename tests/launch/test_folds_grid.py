@@ -217,6 +217,27 @@ def test_folds_of_different_tasks_have_no_best(tmp_path, database, capsys, key, 
     said = capsys.readouterr()
     assert said.err == ""
     assert ("best of 2" in said.out) == (key == "agent")
+    note = f"the jobs have different tasks ({key}), so the table names none as the best"
+    assert (note in said.out) == (key != "agent")
+
+
+@pytest.mark.parametrize("folds", ["3", "leave_one_out"])
+def test_grid_of_some_folds_says_how_many_there_are(write_labelmap, tmp_path, database, capsys, folds):
+    for name in ("a.nrrd", "b.nrrd", "c.nrrd"):
+        write_labelmap(name)
+    (tmp_path / "manifest.json").write_text("{}")
+    store, experiment_id = store_in(tmp_path, "a")
+    run_id = store.create_run(experiment_id, name="grid", tags={}).info.run_id
+    params = {"data.folds": folds, "data.path": str(tmp_path)}
+    outcomes, runs = {}, []
+    for fold in ("0", "1"):
+        folder = left_by_a_run(tmp_path / fold, f"wrist{fold}", [1.0])
+        outcomes[fold] = JobOutcome(f"data.fold={fold}", f"data.fold={fold}", metrics={})
+        of_run = {"tags": {"job": fold, "folder": str(folder)}, "params": params | {"data.fold": fold}}
+        runs.append(SimpleNamespace(data=SimpleNamespace(**of_run)))
+    grid = Grid(run_id=run_id, tracking={}, overrides=["data.fold=0,1"], shared=[])
+    keep_tables(jobs_table(outcomes, {}, have_same_task=True), tmp_path, grid, outcomes, runs, store)
+    assert "agent, 2 of 3 folds" in capsys.readouterr().out
 
 
 def test_damaged_evaluation_of_a_fold_is_an_error_in_one_line(tmp_path):

@@ -388,6 +388,19 @@ MISTAKES = [
         "study.space.network.vector.hidden_sizes.choices=[[8]]",
         "is not allowed: there is no key 'vector' in network, but only hidden_sizes or activation",
     ),
+    (
+        "+study.space.env.max_steps.choices=[5,50]",
+        "env.max_steps=5 is not allowed: it is another task than the",
+    ),
+    (
+        "+study.space.env.ends.choices=[on_budget]",
+        "env.ends=on_budget is not allowed: study.objectives names",
+    ),
+    ("study.objectives=[minimize success_rate]", "study.objectives has 'minimize success_rate', but it must be 'maxi"),
+    (
+        "study.constraints=['success_rate >= 95']",
+        "has 'success_rate >= 95', which no trial can satisfy: success_rate is from 0 to 1",
+    ),
     ("agent=random", "but the trials of this study need one that learns"),
     ("training.env_steps=-1", "training.env_steps is -1, but it must be a whole number"),
 ]

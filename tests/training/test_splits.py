@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from armscan.errors import InvalidValueError
+from armscan.errors import InvalidValueError, VolumeError
 from armscan.training import Split, mixed_data, nifti_data, phantom_data
 from armscan.training.subject_splits import _drawn
 from armscan.volumes import LabelVolume, ManipulatorAction
@@ -193,6 +193,14 @@ def test_split_refuses_a_copy_of_a_volume_in_another_part(tiny_volume):
         InvalidValueError, match=r"c \(test\) is a copy of a \(training\), but a wrist must be in one part"
     ):
         Split({"a": tiny_volume, "b": replace(tiny_volume)}, {"d": other}, {"c": replace(tiny_volume)})
+
+
+def test_copies_in_one_part_are_of_one_subject(tiny_volume):
+    others = [replace(tiny_volume, labels=np.roll(tiny_volume.labels, n, axis=0)) for n in (1, 2)]
+    with pytest.raises(VolumeError, match="b is a copy of a, but has another subject"):
+        Split({"c": others[0]}, {"d": others[1]}, {"a": tiny_volume, "b": replace(tiny_volume)})
+    copies = {name: tiny_volume.of_subject("S") for name in "ab"}
+    Split({"c": others[0]}, {"d": others[1]}, copies)
 
 
 def test_split_refuses_a_copy_that_has_another_plane(tiny_volume):

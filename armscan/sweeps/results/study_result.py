@@ -38,6 +38,7 @@ class StudyResult:
         n_untested: Number of trainings of the test that have not ended. Default: 0.
         have_others_failed: Whether a training of every other candidate failed in the race. Default: False.
         violated: Constraints of the study that configurations violated in the race. Default: none.
+        n_left_out: Number of their trainings with seeds beyond `study.final_eval.test_seeds`. Default: 0.
         is_repeated: Whether trainings with an earlier configuration of the study were tested before. Default: False.
         changes: Notes on changes of the study's configuration and of armscan's code. Default: none.
     """
@@ -52,6 +53,7 @@ class StudyResult:
     n_untested: int = 0
     have_others_failed: bool = False
     violated: Mapping[int, Sequence[str]] = field(default_factory=dict)
+    n_left_out: int = 0
     is_repeated: bool = False
     changes: Sequence[str] = ()
 
@@ -61,6 +63,9 @@ class StudyResult:
         notes = [*self.changes]
         if self.n_seeds < self.n_planned:
             notes.append(f"only {self.n_seeds} of {self.n_planned} seeds have been trained to their end")
+        if self.n_left_out:
+            these = counted(self.n_left_out, "further training")
+            notes.append(f"{these} on the test volumes, left out: study.final_eval.test_seeds is {self.n_planned}")
         for number, violated in self.violated.items():
             name = "the control" if number == CONTROL else name_of(number)
             but = "" if self.chosen in self.violated else ", so it could not be chosen"
@@ -160,6 +165,13 @@ def study_result(final: FinalEvaluation) -> StudyResult | None:
         settings={name_of(each.number): " ".join(overrides_of(settings_of(searched, each.number))) for each in results},
         n_untested=final.n_untested,
         violated={number: each for number, each in final.violated().items() if number in race.standings},
+        n_left_out=sum(
+            final.is_current(trial)
+            and OF_CONFIG in trial.user_attrs
+            and training_of(trial)[0] in both
+            and training_of(trial)[1] not in final.test_seeds
+            for trial in complete
+        ),
         # Those of the first version have no checksum, and other seeds.
         is_repeated=any(
             not final.is_current(trial)

@@ -91,6 +91,8 @@ class Parameter:
                 "command line replaces a range"
             )
         read = (_Choices if "choices" in described else _Range).read(where, described)
+        if isinstance(read, _Range) and read.log and not read.low > 0:
+            raise InvalidValueError(f"{where}.low is {read.low}, but it must be above 0, because log is true")
         try:
             distribution = read.distribution()
         except (ValueError, UserWarning) as error:
@@ -179,3 +181,17 @@ def rounded_overrides(chosen: Mapping[str, Value]) -> list[str]:
     return overrides_of(
         {key: float(f"{each:.4g}") if isinstance(each, float) else each for key, each in chosen.items()}
     )
+
+
+def describe(distribution: BaseDistribution) -> str:
+    """Return a range or choices in words, such as `0.001 to 0.1, log`."""
+    drawn: Any = distribution
+    if isinstance(drawn, CategoricalDistribution):
+        return ", ".join(map(str, drawn.choices))
+    is_whole = isinstance(drawn, IntDistribution)
+    # `g` would round large integers.
+    form = "d" if is_whole else "g"
+    how = ", whole" if is_whole else ""
+    how += ", log" if drawn.log else ""
+    how += f", in steps of {drawn.step:{form}}" if drawn.step is not None and not (is_whole and drawn.step == 1) else ""
+    return f"{drawn.low:{form}} to {drawn.high:{form}}{how}"

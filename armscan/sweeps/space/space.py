@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
-from optuna.distributions import CategoricalDistribution, distribution_to_json
+from optuna.distributions import CategoricalDistribution, distribution_to_json, json_to_distribution
 from optuna.trial import BaseTrial
 
 from armscan.config.literal import hydra_literal
 from armscan.errors import InvalidValueError, listed
-from armscan.sweeps.space.parameter import Parameter, Value, optuna_value
+from armscan.sweeps.space.parameter import Parameter, Value, describe, optuna_value
 
 
 @dataclass(frozen=True)
@@ -123,6 +124,20 @@ class Space:
             each.name: distribution_to_json(each.distribution) + (f" when {dict(each.when)}" if each.when else "")
             for each in self.parameters
         }
+
+
+def in_words(described: Mapping[str, str]) -> dict[str, str]:
+    """Return a space of `Space.to_plain` with each range and its choices in words."""
+    return {name: _in_words(text) for name, text in described.items()}
+
+
+def _in_words(text: str) -> str:
+    try:
+        _, end = json.JSONDecoder().raw_decode(text)
+        return describe(json_to_distribution(text[:end])) + text[end:]
+    # A damaged storage.
+    except (ValueError, KeyError, TypeError):
+        return text
 
 
 def is_conditional(described: str) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,11 +24,13 @@ from armscan.errors import ArmscanError, InvalidValueError, StudyError, listed, 
 from armscan.sweeps.scheduling.state import TEST_PREFIX
 from armscan.sweeps.space.parameter import Value, overrides_of
 from armscan.sweeps.space.space import Space
-from armscan.sweeps.study.arguments import fixed_by
+from armscan.sweeps.study.arguments import TRAINING_TASK, fixed_by
 from armscan.sweeps.study.samplers import CmaEsSampler
 from armscan.sweeps.study.settings import FinalEvalSettings, StudySettings
+from armscan.sweeps.study.task_check import check_objectives, check_same_task
 from armscan.sweeps.study.terminators import Terminator
 from armscan.sweeps.tasks.task import Task
+from armscan.training.metric_display import bounds_of
 from armscan.utils.files import nearest_existing
 from armscan.utils.validation import missing_members
 
@@ -86,6 +89,12 @@ def _task_of(settings: StudySettings, config: DictConfig) -> Task:
             f"study.task is {settings.task['_target_']}, whose final_metric is {task.final_metric!r}, but it must "
             f"begin with {TEST_PREFIX}, as all metrics that its evaluate returns"
         )
+    _check_returned(settings, task, config)
+    return task
+
+
+def _check_returned(settings: StudySettings, task: Task, config: DictConfig) -> None:
+    """Check that a trial with a configuration returns what objectives and constraints name."""
     returned = task.metrics(config)
     for name in settings.objectives:
         if name not in returned:
@@ -97,7 +106,12 @@ def _task_of(settings: StudySettings, config: DictConfig) -> Task:
             raise InvalidValueError(
                 f"study.constraints has '{constraint}', but a trial returns only {listed(returned)}"
             )
-    return task
+        low, high = bounds_of(constraint.metric)
+        if constraint.bound < low if constraint.is_upper else constraint.bound > high:
+            allowed = f"at least {low:g}" if math.isinf(high) else f"from {low:g} to {high:g}"
+            raise InvalidValueError(
+                f"study.constraints has '{constraint}', which no trial can satisfy: {constraint.metric} is {allowed}"
+            )
 
 
 def make(name: str, described: Mapping[str, Any], kind: type[Any], **arguments: Any) -> Any:
@@ -143,7 +157,7 @@ def check_space(settings: StudySettings, task: Task, overrides: Sequence[str], c
         config: Configuration of its trials without the searched values.
 
     Raises:
-        InvalidValueError: If a key is unknown, or a value not allowed.
+        InvalidValueError: If a key is unknown, a value not allowed, or trials would not compare.
     """
     tried = list(settings.space.extremes())
     # Groups and top-level keys: another choice may remove keys that other parameters set.
@@ -153,10 +167,18 @@ def check_space(settings: StudySettings, task: Task, overrides: Sequence[str], c
         with _named(chosen):
             compose_run([*overrides, *overrides_of(chosen)])
     task.check(config)
+    trains = settings.task["_target_"] == TRAINING_TASK
+    if trains:
+        check_objectives(settings.objectives, config)
     _check_final_episodes(settings.final_eval, OmegaConf.select(config, EPISODES_KEY))
     for chosen in (*tried, *map(settings.space.completed, whole)):
         with _named(chosen):
-            task.check(compose_run([*overrides, *overrides_of(chosen)])[0])
+            of_trial, _ = compose_run([*overrides, *overrides_of(chosen)])
+            task.check(of_trial)
+            _check_returned(settings, task, of_trial)
+            if trains:
+                check_objectives(settings.objectives, of_trial)
+                check_same_task([*settings.objectives], config, of_trial)
 
 
 def _check_final_episodes(final: FinalEvalSettings, n_of_trials: int | None) -> None:

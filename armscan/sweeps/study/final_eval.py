@@ -257,12 +257,17 @@ def to_test(race: Race) -> list[int]:
     return list(dict.fromkeys((race.chosen, CONTROL)))
 
 
-def n_trainings(settings: FinalEvalSettings) -> tuple[int, int]:
+def n_trainings(settings: FinalEvalSettings, n_trials: int) -> tuple[int, int]:
     """Return a lower and an upper bound on the number of trainings of a final evaluation in which none fails.
 
     The lower bound assumes that the control is far ahead as soon as it has enough seeds.
+
+    Args:
+        settings: Settings of the final evaluation.
+        n_trials: Number of trials of the search, which may be fewer than its candidates.
     """
-    if not settings.top_k:
+    n_candidates = min(settings.top_k, n_trials)
+    if not n_candidates:
         return 0, 0
-    fewest, most = budget(settings.top_k + 1, min_seeds=settings.min_seeds, mean_seeds=settings.mean_seeds)
+    fewest, most = budget(n_candidates + 1, min_seeds=settings.min_seeds, mean_seeds=settings.mean_seeds)
     return fewest + settings.test_seeds, most + 2 * settings.test_seeds

@@ -7,10 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from stat import S_ISDIR
 from statistics import fmean
-from typing import Any
 
 import optuna
-from optuna.distributions import CategoricalDistribution, IntDistribution
 from optuna.trial import TrialState
 from rich.console import Console
 from rich.table import Column, Table
@@ -21,7 +19,7 @@ from armscan.sweeps.scheduling.population import Population
 from armscan.sweeps.scheduling.race import budget, round_size
 from armscan.sweeps.scheduling.state import StudyState, seconds_of
 from armscan.sweeps.scheduling.termination import ended_because
-from armscan.sweeps.space.parameter import Parameter
+from armscan.sweeps.space.parameter import describe
 from armscan.sweeps.study.final_eval import FinalEvaluation, n_trainings
 from armscan.sweeps.study.settings import FinalEvalSettings, StudySettings
 from armscan.sweeps.study.warm_start import InitialTrials
@@ -58,7 +56,7 @@ def print_plan(
     )
     for parameter in settings.space.parameters:
         needs = ", ".join(f"{name} is {' or '.join(map(str, values))}" for name, values in parameter.when.items())
-        table.add_row(*map(Text, (parameter.name, _values(parameter), needs)))
+        table.add_row(*map(Text, (parameter.name, describe(parameter.distribution), needs)))
     console.print(table)
     objectives = ", ".join(f"{direction} {name}" for name, direction in settings.objectives.items())
     limits = [counted(settings.n_trials, "trial")]
@@ -69,7 +67,7 @@ def print_plan(
     )
     console.print(f"objective  {objectives}, over {_seeds(settings.seeds)}")
     console.print(f"limits     {', '.join(limits)}; {counted(settings.workers, 'worker')}")
-    console.print(f"then       {_final(settings.final_eval)}")
+    console.print(f"then       {_final(settings.final_eval, settings.n_trials)}")
     for each in initial:
         console.print(printable(f"begins     {each.message}"), markup=False, highlight=False)
     others = (("failed", state.failed), ("waiting", state.waiting))
@@ -160,7 +158,7 @@ def final_trainings_left(settings: StudySettings, final: FinalEvaluation | None,
         final: The final evaluation; None if it has not been started.
         n_left: Trials of the search that are left, which may change the candidates, or not.
     """
-    fewest, most = n_trainings(settings.final_eval)
+    fewest, most = n_trainings(settings.final_eval, settings.n_trials)
     if final is None:
         return fewest, most
     if n_left:
@@ -178,12 +176,12 @@ def final_trainings_left(settings: StudySettings, final: FinalEvaluation | None,
     return least + asked.test_seeds, most + 2 * asked.test_seeds
 
 
-def _final(settings: FinalEvalSettings) -> str:
+def _final(settings: FinalEvalSettings, n_trials: int) -> str:
     """Return how many trainings the final evaluation takes."""
-    fewest, most = n_trainings(settings)
+    fewest, most = n_trainings(settings, n_trials)
     if not most:
         return "no final evaluation"
-    candidates = counted(settings.top_k, "candidate")
+    candidates = counted(min(settings.top_k, n_trials), "candidate")
     n_first, n_mean = settings.min_seeds, settings.mean_seeds
     further = f" at first, and at most {n_mean} each on average," if n_first < n_mean else ""
     return (
@@ -195,16 +193,3 @@ def _final(settings: FinalEvalSettings) -> str:
 
 def _seeds(seeds: Sequence[int]) -> str:
     return f"{'the seed' if len(seeds) == 1 else 'the seeds'} {', '.join(map(str, seeds))}"
-
-
-def _values(parameter: Parameter) -> str:
-    drawn: Any = parameter.distribution
-    if isinstance(drawn, CategoricalDistribution):
-        return ", ".join(map(str, drawn.choices))
-    is_whole = isinstance(drawn, IntDistribution)
-    # `g` would round large integers.
-    form = "d" if is_whole else "g"
-    how = ", whole" if is_whole else ""
-    how += ", log" if drawn.log else ""
-    how += f", in steps of {drawn.step:{form}}" if drawn.step is not None and not (is_whole and drawn.step == 1) else ""
-    return f"{drawn.low:{form}} to {drawn.high:{form}}{how}"

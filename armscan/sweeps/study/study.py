@@ -16,7 +16,7 @@ from armscan.config.legacy import renamed
 from armscan.errors import StudyError
 from armscan.sweeps.scheduling.population import searched_values
 from armscan.sweeps.scheduling.state import is_feasible, loss_signs
-from armscan.sweeps.space.space import is_conditional
+from armscan.sweeps.space.space import in_words, is_conditional
 from armscan.sweeps.storage.attribute_names import (
     EARLIER_CONFIGS,
     FIXED,
@@ -151,9 +151,16 @@ def _check_same(settings: StudySettings, study: optuna.Study, wanted: Mapping[st
     check_trials(study)
     whose = f"the study {settings.name} in {settings.storage if '://' not in settings.storage else 'its storage'}"
     other = "; give study.name another value"
-    for key, what in ((SPACE, "searches another space"), (OBJECTIVES, "has other objectives")):
-        if differences := listed_differences(renamed(there.get(key, {})), wanted[key]):
-            raise StudyError(f"{whose} {what}: {differences}{other}")
+    spaces = renamed(there.get(SPACE, {})), wanted[SPACE]
+    if differences := listed_differences(*spaces):
+        # Words may be the same for different choices, such as 1 and the text 1.
+        differences = listed_differences(*map(in_words, spaces)) or differences
+        raise StudyError(
+            f"{whose} searches another space: {differences}{other}, and study.warm_start=[{settings.name}] to begin "
+            "with its trials"
+        )
+    if differences := listed_differences(there.get(OBJECTIVES, {}), wanted[OBJECTIVES]):
+        raise StudyError(f"{whose} has other objectives: {differences}{other}")
     # The values of its trials are in this order.
     if [*there[OBJECTIVES]] != [*wanted[OBJECTIVES]]:
         raise StudyError(f"{whose} has its objectives in another order: {', '.join(there[OBJECTIVES])}{other}")

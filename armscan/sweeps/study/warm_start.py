@@ -35,7 +35,7 @@ from armscan.sweeps.storage.attributes import FINAL_SUFFIXES, check_trials
 from armscan.sweeps.storage.reports import REPORT
 from armscan.sweeps.storage.storage import Storage, existing_storage
 from armscan.sweeps.study.arguments import SEARCH_PATH
-from armscan.sweeps.study.fixed_config import comparable_settings, config_changes, differing, fixed_of
+from armscan.sweeps.study.fixed_config import NOT_THERE, comparable_settings, config_changes, differing, fixed_of
 from armscan.sweeps.study.settings import OPTUNA_PRUNERS, StudySettings
 from armscan.sweeps.study.study import best_trials, is_ours
 from armscan.utils.text import counted
@@ -178,7 +178,8 @@ def _of_study(
     settings_of = {trial.number: chosen for trial, chosen in fitting if chosen}
     best = [trial for trial in best_trials(source, len(trials)) if trial.number in settings_of]
     first = first_different(settings_of[trial.number] for trial in best)
-    message += f"none taken with its value, because {difference}; the settings of the best {len(first)} are tried first"
+    tried = f"the settings of the best {len(first)} are tried first" if first else "it has no best trial to begin with"
+    message += f"none taken with its value, because {difference}; {tried}"
     # Of equal settings, those of the best trial are tried.
     params_of = {repr(settings_of[trial.number]): renamed(trial.params) for trial in reversed(best)}
     if moved := [values for each in first if (values := _moved(params_of[repr(each)], each))]:
@@ -214,7 +215,8 @@ def _difference(source: optuna.Study, wanted: Mapping[str, Any]) -> str | None:
         return None
     key, (then, today) = found[0]
     more = f" ({counted(len(found) - 1, 'further difference')})" if len(found) > 1 else ""
-    return f"its {key} is {then}, and not {today}{more}"
+    pair = f"{then}, which this study lacks" if today == NOT_THERE else f"{then}, and not {today}"
+    return f"its {key} is {pair}{more}"
 
 
 def _is_opposed(source: optuna.Study, wanted: Mapping[str, Any]) -> bool:

@@ -122,7 +122,11 @@ def test_space_extremes_are_only_such_as_a_trial_can_have(when):
         ({"a": {"low": 1, "high": 2, "max": 1}}, "there is no key 'max' in study.space.a, but only when, low, high"),
         ({"a": {"low": 2, "high": 1}}, "study.space.a: `low <= high` must hold, but got (low=2, high=1)"),
         ({"a": {"low": "x", "high": 1}}, "study.space.a.low is 'x', but it must be a finite number"),
-        ({"a": {"low": 0.0, "high": 1.0, "log": True}}, "study.space.a: `low > 0` must hold for `log"),
+        (
+            {"a": {"low": 0.0, "high": 1.0, "log": True}},
+            "study.space.a.low is 0.0, but it must be above 0",
+        ),
+        ({"a": {"low": -1, "high": 1, "log": True}}, "study.space.a.low is -1, but it must be above 0"),
         ({"a": {"low": 1.0, "high": 2.0, "log": 1}}, "study.space.a.log is 1, but it must be true or false"),
         (
             {"a": {"low": 1, "high": 9, "log": True, "step": 2}},

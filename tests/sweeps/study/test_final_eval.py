@@ -2,6 +2,7 @@
 
 import math
 import random
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -154,7 +155,7 @@ def test_workers_that_die_change_nothing_and_no_training_is_run_twice(tmp_path, 
         ours, theirs = (trained(getattr(final, name)) for final in (quiet, killed))
         assert len(theirs) == len(set(theirs))
         assert sorted(ours) == sorted(theirs)
-    fewest, most = n_trainings(killed.settings)
+    fewest, most = n_trainings(killed.settings, len(LUCK))
     assert len(trained(quiet.selection)) + len(trained(quiet.test)) in range(fewest, most + 1)
 
 
@@ -246,9 +247,22 @@ def test_plan_counts_the_final_trainings_that_are_left(storage_uri):
     assert f"at most {most} left" in final_line(settings, final, [9, 6])
 
 
+def test_plan_has_no_more_candidates_than_trials(storage_uri):
+    settings = searched(storage_uri)[1].final_eval.model_copy(update={"top_k": 100})
+    assert n_trainings(settings, 2) == n_trainings(settings.model_copy(update={"top_k": 2}), 100)
+
+
+def test_result_with_fewer_test_seeds_names_the_trainings_that_are_left_out(storage_uri):
+    final = run(storage_uri)
+    assert not [note for note in study_result(final).notes if "left out" in note]
+    fewer = replace(final, settings=final.settings.model_copy(update={"test_seeds": 2}))
+    (note,) = (note for note in study_result(fewer).notes if "left out" in note)
+    assert note == "2 further trainings on the test volumes, left out: study.final_eval.test_seeds is 2"
+
+
 def test_plan_knows_that_a_round_of_the_race_occupies_few_workers(storage_uri):
     settings = searched(storage_uri)[1].model_copy(update={"workers": 6})
-    fewest, most = n_trainings(settings.final_eval)
+    fewest, most = n_trainings(settings.final_eval, settings.n_trials)
     hours = hours_left(settings, None, n_left=12, trial_s=3600.0, training_s=1800.0)
     # Two trainings at a time, as a round has.
     assert hours == pytest.approx((2.0 + fewest * 0.5 / 6, 2.0 + most * 0.5 / 2))

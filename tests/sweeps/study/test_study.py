@@ -73,7 +73,11 @@ def test_study_goes_on_where_what_its_trials_do_is_the_same(storage_uri, changes
         ({}, {"stack": 4}, "stack was not there, is 4; accept that with study.allow_config_changes=true"),
         ({"seeds": (0, 1)}, {}, "study.seeds was [0], is [0, 1]"),
         ({"objectives": {"solved": "maximize"}}, {}, "has other objectives: mean_steps was minimize, is not there"),
-        ({"space": Space.read({"agent.tau": {"low": 0.1, "high": 0.2}})}, {}, "searches another space: agent.lr was {"),
+        (
+            {"space": Space.read({"agent.tau": {"low": 0.1, "high": 0.2}})},
+            {},
+            "another space: agent.lr was 0.0001 to 0.01, is ",
+        ),
     ],
     ids=lambda value: "",
 )
