@@ -19,8 +19,7 @@ from armscan.stats.on_plane import OnPlane, leading_of
 from armscan.tracking import TrackingStore
 from armscan.tracking.outbox import ENDED
 from armscan.tracking.run import MAX_DEPTH
-from armscan.tracking.tags import PARENT_TAG
-from armscan.training.episode_results import TEST_METRICS
+from armscan.tracking.tags import PARENT_TAG, TEST_VOLUMES_PREFIX
 
 # Attributes of a row by sort key.
 SORTS = {
@@ -129,7 +128,7 @@ class RunRow:
         return self._tested("mean_steps")
 
     def _tested(self, metric: str) -> float | None:
-        return self.run.data.metrics.get(f"{TEST_METRICS}/{metric}")
+        return self.run.data.metrics.get(f"{TEST_VOLUMES_PREFIX}{metric}")
 
     def expanded(self, depth: int = 0) -> Iterator[RunRow]:
         """Yield the row and those below it, each below its parent."""

@@ -34,7 +34,7 @@ BEST_TAG = "best.run"
 CONTINUED_TAG = "continued_by"
 # Of a study's runs: its name and storage, the number of the trial, and whether the trial was pruned.
 STUDY_TAG, STORAGE_TAG, TRIAL_TAG, PRUNED_TAG = "study", "study.storage", "trial", "pruned"
-# Prefixes of metrics: of validations, and of what a study measures to select a configuration.
-VALIDATION_PREFIX, SELECTION_PREFIX = "validation/", "selection/"
+# Prefixes of metrics: of validations, of what a study measures to select a configuration, and of the test volumes.
+VALIDATION_PREFIX, SELECTION_PREFIX, TEST_VOLUMES_PREFIX = "validation/", "selection/", "test_volumes/"
 # Metric of a training: the environment steps after which its best weights were kept.
 BEST_ENV_STEP = "best_env_step"

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 
 from armscan.stats.on_plane import ON_PLANE
-from armscan.tracking.tags import SELECTION_PREFIX, VALIDATION_PREFIX
+from armscan.tracking.tags import SELECTION_PREFIX, TEST_VOLUMES_PREFIX, VALIDATION_PREFIX
 
 VIEW_KEY = "armscan"
 VIEW_TAG = f"mlflow.sharedViewState.{VIEW_KEY}"
@@ -49,7 +49,7 @@ def _line(metric: str, title: str) -> dict[str, object]:
 
 def _columns() -> dict[str, int]:
     """Return the columns in their order, each with its width in pixels."""
-    leading, *others = (f"test_volumes/{name}" for name in FIGURES)
+    leading, *others = (f"{TEST_VOLUMES_PREFIX}{name}" for name in FIGURES)
     metrics = [
         leading,
         f"random/{LEADING}",

@@ -218,7 +218,13 @@ def test_run_whose_folder_was_removed_fails_at_once(store, tmp_path, capsys, sta
     client, experiment_id = store
     folder = tmp_path / "run"
     tracked = TrackedRun.start(client, experiment_id, name="n", config={}, tags={}, folder=folder)
-    shutil.rmtree(folder)
+
+    def is_removed():
+        # The run's own thread may write there meanwhile.
+        shutil.rmtree(folder, ignore_errors=True)
+        return not folder.exists()
+
+    wait_until(is_removed)
     refused = pytest.raises(TrackingError, match=r"its folder .* was removed")
     with refused if status == "FINISHED" else contextlib.nullcontext():
         # It would wait for a store that is unavailable.
