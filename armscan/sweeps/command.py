@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from armscan.config.compose import compose_run
 from armscan.config.credentials import check_address
@@ -17,7 +18,7 @@ from armscan.sweeps.study.arguments import STORAGE, StudyCommand, trial_override
 from armscan.sweeps.study.components import check_space, read_settings
 from armscan.sweeps.study.final_eval_storage import stored_final_eval
 from armscan.sweeps.study.fixed_config import fixed_config
-from armscan.sweeps.study.open import open_for_work
+from armscan.sweeps.study.open import check_owner, open_for_work
 from armscan.sweeps.study.plan import print_plan
 from armscan.sweeps.study.population import population_of
 from armscan.sweeps.study.study import existing_study, is_reconfigured
@@ -55,6 +56,7 @@ def run_study(arguments: Sequence[str], launch: Callable[[Sequence[str]], object
     check_space(settings, task, overrides, config)
     initial = initial_trials(settings, overrides, fixed, existing)
     if given.is_plan:
+        check_owner(Path(settings.folder), settings.name)
         final = None
         if storage is not None and existing is not None:
             final = stored_final_eval(storage, existing)

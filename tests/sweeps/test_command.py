@@ -396,6 +396,11 @@ MISTAKES = [
         "+study.space.env.ends.choices=[on_budget]",
         "env.ends=on_budget is not allowed: study.objectives names",
     ),
+    (
+        "study.space.agent.lr.high=0.02",
+        "agent.lr=0.01",
+        "agent.lr is given a value, and study.space.agent.lr to search it: give one of them",
+    ),
     ("study.objectives=[minimize success_rate]", "study.objectives has 'minimize success_rate', but it must be 'maxi"),
     (
         "study.constraints=['success_rate >= 95']",

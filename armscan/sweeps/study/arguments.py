@@ -55,6 +55,10 @@ class StudyCommand:
             raise InvalidValueError("study is a section of the configuration: give its keys, such as study.n_trials=40")
         for override in parsed:
             _check(override)
+        changed = filter(None, map(SPACE_OVERRIDE.fullmatch, overrides))
+        searched = {key for key, _, value in (each.groups() for each in changed) if value != "null"}
+        if both := [key for key in keys if key in searched]:
+            raise InvalidValueError(f"{both[0]} is given a value, and {SPACE}.{both[0]} to search it: give one of them")
         return cls(tuple(_with_one_space(overrides)), PLAN in arguments)
 
     @property

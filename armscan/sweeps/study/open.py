@@ -120,7 +120,13 @@ def _claim_folder(folder: Path, study: optuna.Study) -> None:
         # Earlier versions wrote no name.
         is_known = folder.name == name or not (folder / "trials").exists() or bool(study.get_trials(deepcopy=False))
         atomic_write(file, name if is_known else "another study")
-    if (owner := file.read_text().strip()) != name:
+    check_owner(folder, name)
+
+
+def check_owner(folder: Path, name: str) -> None:
+    """Raise `StudyError` if the files of another study than `name` are in a folder."""
+    file = folder / OWNER_FILE
+    if file.exists() and (owner := file.read_text().strip()) != name:
         raise StudyError(
             f"study.folder is {str(folder)!r}, which has the files of {owner}: give study.folder another value"
         )

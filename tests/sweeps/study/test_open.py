@@ -14,7 +14,7 @@ from armscan.errors import StudyError, TrackingError
 from armscan.sweeps.storage.attribute_names import NOTE_SUM, STUDY_RUN
 from armscan.sweeps.storage.storage import open_storage
 from armscan.sweeps.study.dashboard import note_run
-from armscan.sweeps.study.open import OWNER_FILE, _claim_folder
+from armscan.sweeps.study.open import OWNER_FILE, _claim_folder, check_owner
 from armscan.sweeps.study.study import make_study
 from tests.sweeps.study.test_study import settings
 
@@ -136,6 +136,9 @@ def test_folder_of_another_study_is_refused(opened):
     first.folder.rename(other)
     with pytest.raises(StudyError, match="which has the files of a: give study"):
         opened(name="b")
+    with pytest.raises(StudyError, match="which has the files of a: give study"):
+        check_owner(other, "b")
+    check_owner(other, "a")
     # Files of an earlier version, which wrote no name.
     (other / OWNER_FILE).unlink()
     (other / "trials").mkdir()
