@@ -46,10 +46,8 @@ def own_split(source: EvaluatedAgent, parts: Sequence[str] = PARTS) -> Split:
         line = one_line_message(error)
         if run is None or line is None:
             raise
-        where, host = (
-            run.tags.get(WORKING_FOLDER_TAG, "a folder that was not kept"),
-            run.tags.get(HOST_TAG, "some host"),
-        )
+        where = run.tags.get(WORKING_FOLDER_TAG, "a folder that was not kept")
+        host = run.tags.get(HOST_TAG, "some host")
         raise InvalidValueError(
             f"the volumes of run {run.run_id} cannot be read: {line} (it was started in {where} on {host})"
         ) from error

@@ -75,9 +75,7 @@ def _evaluations(folder: Path) -> dict[str, Evaluation]:
     try:
         agent = Evaluation.of_dict(json.loads((folder / EVALUATION_FILE).read_text())[TEST])
         baselines = json.loads((folder / BASELINES_FILE).read_text())
-        return {
-            AGENT_ON_ALL_FOLDS: agent,
-            **{f"{name}{ALL_FOLDS}": Evaluation.of_dict(each) for name, each in baselines.items()},
-        }
+        of_baselines = {f"{name}{ALL_FOLDS}": Evaluation.of_dict(each) for name, each in baselines.items()}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise TrackingError(f"the evaluations in {folder} cannot be read: {in_one_line(error)}") from error
+    return {AGENT_ON_ALL_FOLDS: agent, **of_baselines}
