@@ -11,7 +11,7 @@ from armscan.training.subject_splits import PHANTOMS, parts_by_subject
 from armscan.utils.text import counted
 from armscan.utils.validation import check_choice, check_int, check_path
 from armscan.volumes import Dataset, LabelVolume, load_phantoms, open_dataset
-from armscan.volumes.dataset import SPLITS, check_copies, copies_among, first_volumes
+from armscan.volumes.dataset import SPLITS, check_copy, copies_among, first_volumes
 from armscan.volumes.phantom import VERSIONS
 from armscan.volumes.phantom.generate import PHANTOM_NAME
 from armscan.volumes.volume import palm_notes
@@ -64,14 +64,15 @@ class Split:
 
     def _check_copies(self) -> None:
         of_parts = {(part, name): volume for part, volumes in self.parts.items() for name, volume in volumes.items()}
-        for (its_part, other), (part, name) in copies_among(of_parts):
+        copies = [*copies_among(of_parts)]
+        for (its_part, other), (part, name) in copies:
             if part != its_part:
                 raise InvalidValueError(
                     f"{name} ({part}) is a copy of {other} ({its_part}), but a wrist must be in one part: "
                     "give both the same subject in the manifest, or remove one"
                 )
-        for volumes in self.parts.values():
-            check_copies(volumes)
+        for (_, other), (part, name) in copies:
+            check_copy(self.parts[part], other, name)
 
     @property
     def parts(self) -> dict[str, dict[str, LabelVolume]]:

@@ -197,11 +197,16 @@ def _manifest_of(path: str | Path, *, require_manifest: bool) -> tuple[Path | No
 def check_copies(volumes: Mapping[str, LabelVolume]) -> None:
     """Raise `VolumeError` if two volumes of different subjects have the same voxels: a wrist would count twice."""
     for other, name in copies_among(volumes):
-        if (volumes[other].subject or other) != (volumes[name].subject or name):
-            raise VolumeError(
-                f"{name} is a copy of {other}, but has another subject: give both the same subject in the manifest, or "
-                "remove one"
-            )
+        check_copy(volumes, other, name)
+
+
+def check_copy(volumes: Mapping[str, LabelVolume], other: str, name: str) -> None:
+    """Raise `VolumeError` if a volume, a copy of another one, has another subject."""
+    if (volumes[other].subject or other) != (volumes[name].subject or name):
+        raise VolumeError(
+            f"{name} is a copy of {other}, but has another subject: give both the same subject in the manifest, or "
+            "remove one"
+        )
 
 
 def copies_among(volumes: Mapping[Key, LabelVolume]) -> Iterator[tuple[Key, Key]]:

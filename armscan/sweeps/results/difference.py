@@ -17,10 +17,10 @@ from armscan.stats.paired import paired_difference
 from armscan.sweeps.results.final_results import bounds_in, scores_of, subjects_of
 from armscan.sweeps.scheduling.state import TEST_PREFIX, metrics_of_test
 from armscan.sweeps.storage.attribute_names import METRICS, OBJECTIVES
+from armscan.sweeps.study.task_check import MAXIMIZE
 from armscan.training.metric_display import is_rate, leading_among, title_of, value_text
 from armscan.utils.text import PERCENT, formatted, is_zero
 
-MAXIMIZE = "maximize"
 HOW = (
     "A difference is the mean of the paired differences over all seeds and test volumes; its interval is for other "
     "seeds and subjects. The probability of improvement is the probability that a training of the chosen configuration "

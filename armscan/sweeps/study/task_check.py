@@ -60,7 +60,7 @@ def check_same_task(objectives: Sequence[str], control: DictConfig, other: DictC
     """
     if control.data != other.data:
         before, now = (volumes_of(each).fingerprints() for each in (control, other))
-        if parts := [part for part in PARTS if part != "training" and before[part] != now[part]]:
+        if parts := [part for part in PARTS[1:] if before[part] != now[part]]:
             raise InvalidValueError(
                 f"the {' and '.join(parts)} volumes are not the control's, so results would not compare"
             )
